@@ -1,0 +1,42 @@
+"""Differentiable simulation of mechanisms with exact closed loops.
+
+Importing linkax switches JAX to double precision (`jax_enable_x64`): loops cannot be closed to
+rounding, nor singular configurations passed, in single precision. `simulate(dtype=jnp.float32)`
+computes in single precision all the same.
+"""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from linkax.equations.kinematics import Motion as Motion  # noqa: E402
+from linkax.equations.reactions import Reaction as Reaction  # noqa: E402
+from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402
+from linkax.linalg.pivoted_qr import pivoted_qr as pivoted_qr  # noqa: E402
+from linkax.model.bodies import GROUND as GROUND  # noqa: E402
+from linkax.model.bodies import Frame as Frame  # noqa: E402
+from linkax.model.bodies import RigidBody as RigidBody  # noqa: E402
+from linkax.model.bodies import box as box  # noqa: E402
+from linkax.model.bodies import point_mass as point_mass  # noqa: E402
+from linkax.model.bodies import rod as rod  # noqa: E402
+from linkax.model.forces import AbstractForce as AbstractForce  # noqa: E402
+from linkax.model.forces import Gravity as Gravity  # noqa: E402
+from linkax.model.forces import JointTorque as JointTorque  # noqa: E402
+from linkax.model.forces import Load as Load  # noqa: E402
+from linkax.model.joints.fixed import Fixed as Fixed  # noqa: E402
+from linkax.model.joints.joint import AbstractJoint as AbstractJoint  # noqa: E402
+from linkax.model.joints.prismatic import Prismatic as Prismatic  # noqa: E402
+from linkax.model.joints.revolute import Revolute as Revolute  # noqa: E402
+from linkax.model.mechanism import Mechanism as Mechanism  # noqa: E402
+from linkax.simulation.accuracy import BALANCED as BALANCED  # noqa: E402
+from linkax.simulation.accuracy import DRAFT as DRAFT  # noqa: E402
+from linkax.simulation.accuracy import PRECISE as PRECISE  # noqa: E402
+from linkax.simulation.accuracy import Accuracy as Accuracy  # noqa: E402
+from linkax.simulation.assembly import AssemblyError as AssemblyError  # noqa: E402
+from linkax.simulation.assembly import assemble as assemble  # noqa: E402
+from linkax.simulation.results import RESULTS as RESULTS  # noqa: E402
+from linkax.simulation.results import SimulationError as SimulationError  # noqa: E402
+from linkax.simulation.simulate import simulate as simulate  # noqa: E402
+from linkax.simulation.solution import Solution as Solution  # noqa: E402
+from linkax.simulation.solution import Violation as Violation  # noqa: E402
+from linkax.simulation.state import State as State  # noqa: E402

@@ -1,0 +1,1 @@
+"""What holds at one instant: poses, twists, mass matrix, forces, loop constraints, reactions."""

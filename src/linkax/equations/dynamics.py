@@ -1,0 +1,120 @@
+"""Mass matrix, forces and energy of the spanning tree.
+
+M v̇ = f without loops; Featherstone (2008), ch. 5 (recursive Newton-Euler) and ch. 6 (composite
+rigid bodies). Inertias are carried from body to body about each one's own reference point, so
+that small bodies far out on a mechanism keep their digits.
+"""
+
+from functools import reduce
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from linkax.equations.kinematics import Configuration, Motion, by_body, over_subtree
+from linkax.model.forces import Load
+from linkax.model.topology import GROUND_INDEX
+from linkax.spatial.rotations import compose, cross, dot, rotate, transpose
+
+
+def world_inertia(configuration: Configuration) -> Float[Array, "n_b 3 3"]:
+    """Inertia tensor of each body about its centre of mass, in ground axes [kg m²]."""
+    rotation = configuration.rotation[:-1]
+    return compose(compose(rotation, configuration.system.inertia), transpose(rotation))
+
+
+def _shifted(mass, first_moment, arm):
+    """What a second moment of mass gains when its reference moves back by `arm`, (n_b, 3, 3)."""
+    product = (
+        arm[:, :, None] * (mass[:, None] * arm + first_moment)[:, None, :] + first_moment[:, :, None] * arm[:, None, :]
+    )
+    trace = jnp.sum(arm * (mass[:, None] * arm + 2.0 * first_moment), axis=-1)
+    return trace[:, None, None] * jnp.eye(3, dtype=arm.dtype) - product
+
+
+def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
+    """Mass matrix M of the tree by composite rigid bodies [kg m², kg m, kg]."""
+    system, topology = configuration.system, configuration.system.topology
+    carrier = np.array(topology.predecessor)
+    above = lambda carried: _onto_carrier(carrier, carried)
+    arm = configuration.center_of_mass()
+    own_moment = system.mass[:, None] * arm
+    nothing = jnp.zeros_like(arm)
+    own_inertia = world_inertia(configuration) + _shifted(system.mass, nothing, arm)
+    mass = over_subtree(system, system.mass)
+    first = over_subtree(system, own_moment + above(mass[:, None] * configuration.link))
+    second = over_subtree(system, own_inertia + above(_shifted(mass, first, configuration.link)))
+
+    body = topology.column_body
+    position = configuration.position[body]
+    angular, at_anchor = configuration.angular, configuration.linear
+    at_body = at_anchor + cross(angular, position)
+    momentum = mass[body][:, None] * at_body + cross(angular, first[body])
+    moment = rotate(second[body], angular) + cross(first[body], at_body) + cross(position, momentum)
+    carried = angular @ moment.T + at_anchor @ momentum.T
+    carries = topology.path[:-1][np.ix_(body, body)].T > 0.0
+    return jnp.where(carries, carried, jnp.where(carries.T, carried.T, 0.0))
+
+
+def _onto_carrier(carrier, carried):
+    """Sum (n_b, …) of the bodies that each body carries directly."""
+    onto = (carrier[None, :] == np.arange(len(carrier))[:, None]).astype(carried.dtype)
+    return (onto @ carried.reshape(len(carrier), -1)).reshape(carried.shape)
+
+
+def applied_load(t, motion: Motion) -> Load:
+    """The sum of what all force elements apply."""
+    loads = [force.load(t, motion) for force in motion.system.forces]
+    return reduce(lambda a, b: Load(*(x + y for x, y in zip(a, b, strict=True))), loads, Load.none(motion.system))
+
+
+def inertial_wrench(motion: Motion, angular_acceleration, acceleration):
+    """Force m a [N] and moment I α + ω × I ω about the centre of mass [N m] of each body, (n_b, 3) each.
+
+    The accelerations are those of the bodies [rad/s²] and of their reference points [m/s²].
+    """
+    system, arm = motion.system, motion.configuration.center_of_mass()
+    omega = motion.angular_velocity[:-1]
+    at_mass = acceleration + cross(angular_acceleration, arm) + cross(omega, cross(omega, arm))
+    inertia = world_inertia(motion.configuration)
+    moment = rotate(inertia, angular_acceleration) + cross(omega, rotate(inertia, omega))
+    return system.mass[:, None] * at_mass, moment
+
+
+def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " n_v"]:
+    """Generalised force of wrenches on bodies, (n_b, 3) each, the moment about the centre of mass."""
+    system, body = configuration.system, configuration.system.topology.column_body
+    arm = configuration.position[:-1] + configuration.center_of_mass()
+    force, moment = over_subtree(system, force), over_subtree(system, moment + cross(arm, force))
+    return dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body])
+
+
+def generalised_force(t, motion: Motion) -> Float[Array, " n_v"]:
+    """f of M v̇ = f: applied forces less velocity-product forces [N m, N]."""
+    load = applied_load(t, motion)
+    force, moment = inertial_wrench(motion, motion.angular_bias[:-1], motion.bias[:-1])
+    return load.joint_force + along_speeds(motion.configuration, load.force - force, load.moment - moment)
+
+
+def kinetic_energy(motion: Motion) -> Float[Array, ""]:
+    """Kinetic energy [J]."""
+    omega, arm = motion.angular_velocity[:-1], motion.configuration.center_of_mass()
+    velocity = motion.velocity[:-1] + cross(omega, arm)
+    spin = rotate(world_inertia(motion.configuration), omega)
+    return jnp.sum(motion.system.mass * dot(velocity, velocity) + dot(omega, spin)) / 2.0
+
+
+def potential_energy(configuration: Configuration) -> Float[Array, ""]:
+    """Potential energy of all force elements that have one [J]."""
+    energies = [force.potential_energy(configuration) for force in configuration.system.forces]
+    return sum(energies, jnp.zeros((), configuration.system.dtype))
+
+
+def body_accelerations(motion: Motion, acceleration: Float[Array, " n_v"]):
+    """Angular accelerations and accelerations of reference points at v̇, (n_b, 3) each."""
+    configuration, system = motion.configuration, motion.system
+    path = jnp.asarray(system.topology.path[:-1], system.dtype)
+    angular = path @ by_body(system, configuration.angular * acceleration[:, None])
+    at_anchor = path @ by_body(system, configuration.linear * acceleration[:, None])
+    linear = at_anchor + cross(angular, configuration.position[:-1])
+    return motion.angular_bias[:-1] + angular, motion.bias[:-1] + linear

@@ -1,0 +1,70 @@
+"""Reactions of all joints at one instant, from accelerations and multipliers."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
+from linkax.equations.kinematics import Motion, by_body, over_subtree
+from linkax.equations.loops import Cuts, bodies_of_cuts, mobile_rows
+from linkax.spatial.rotations import cross
+
+
+class Reaction(NamedTuple):
+    """What a joint does to its child, in ground axes.
+
+    - `force` [N], and `moment` about the origin of the child's frame [N m], (…, 3) each. The
+      parent receives the opposite force at the same point, and the opposite moment.
+    """
+
+    force: Float[Array, "... 3"]
+    moment: Float[Array, "... 3"]
+
+
+def cut_reactions(cuts: Cuts, multipliers) -> Reaction:
+    """Reactions of the cut joints, (n_cut, 3) each: the paper's Table 3, by virtual power."""
+    rows = mobile_rows(cuts)
+    of_rotations, of_translations = jnp.split(multipliers, [len(rows.rotation_cut)])
+    nothing = jnp.zeros_like(cuts.separation)
+    moment = nothing.at[rows.rotation_cut].add(of_rotations[:, None] * cross(rows.second, rows.first))
+    force = nothing.at[rows.translation_cut].add((of_translations / rows.length)[:, None] * rows.direction)
+    return Reaction(force, moment)
+
+
+def reactions(t, motion: Motion, cuts: Cuts, acceleration, multipliers) -> Reaction:
+    """Reactions of all joints, (n_j, 3) each, tree joints first.
+
+    A tree joint carries what its subtree needs: inertia less applied loads less the reactions
+    of cut joints on it (recursive Newton-Euler; the paper's Fig. 6).
+    """
+    configuration, system, topology = motion.configuration, motion.system, motion.system.topology
+    count = topology.num_bodies
+    load, cut = applied_load(t, motion), cut_reactions(cuts, multipliers)
+    force, moment = inertial_wrench(motion, *body_accelerations(motion, acceleration))
+    force, moment = force - load.force, moment - load.moment
+    moment = moment + cross(configuration.position[:-1] + configuration.center_of_mass(), force)
+
+    # All moments about the anchor of each body's tree from here on.
+    parent, child, joints = bodies_of_cuts(topology)
+    on_child = configuration.position[child] + configuration.child_arm[joints]
+    on_parent = configuration.position[parent] + configuration.parent_arm[joints] + cuts.separation
+
+    def onto_bodies(on_children, on_parents):
+        padded = jnp.zeros((count + 1, 3), system.dtype).at[child].add(on_children).at[parent].add(-on_parents)
+        return padded[:-1]
+
+    force = force - onto_bodies(cut.force, cut.force)
+    moment = moment - onto_bodies(cut.moment + cross(on_child, cut.force), cut.moment + cross(on_parent, cut.force))
+    force, moment = over_subtree(system, force), over_subtree(system, moment)
+
+    # From the body that the joint carries to its child, at the child's frame, less the joint's own force.
+    joint_child = np.array(topology.child)[:count]
+    point = configuration.position[joint_child] + configuration.child_arm[:count]
+    moment = moment - cross(point, force)
+    along = load.joint_force[:, None]
+    force = force - by_body(system, along * configuration.sliding)
+    moment = moment - by_body(system, along * configuration.angular)
+    sign = jnp.where(topology.reversed[:, None], -1.0, 1.0).astype(system.dtype)
+    return Reaction(jnp.concatenate([sign * force, cut.force]), jnp.concatenate([sign * moment, cut.moment]))

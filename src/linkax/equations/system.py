@@ -1,0 +1,109 @@
+"""The numbers of a mechanism, stacked in the order of its bodies and joints."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from linkax.model.forces import AbstractForce
+from linkax.model.mechanism import Mechanism
+from linkax.model.topology import GROUND_INDEX, Topology
+
+
+class System(eqx.Module):
+    """A mechanism as arrays: bodies in tree order (n_b), joints tree first, then cut (n_j).
+
+    - `mass` [kg] (n_b,), `center_of_mass` [m] (n_b, 3), `inertia` about it [kg m²] (n_b, 3, 3),
+      in body axes.
+    - `parent_offset`, `child_offset` [m] (n_j, 3): origins of the joint's frames in body axes;
+      zero on ground, whose part is kept apart in `anchor` [m] (n_j, 3), world axes, so that
+      a mechanism far from the origin loses no digits.
+    - `parent_axes`, `child_axes` (n_j, 3, 3): the joint's axes as columns, in body axes.
+    - `loop_length` [m] (n_cut,): half the way around each loop, the unit of its translation rows.
+    - `length` [m]: the mechanism's length, the unit of sliding coordinates.
+    """
+
+    topology: Topology = eqx.field(static=True)
+    mass: Float[Array, " n_b"]
+    center_of_mass: Float[Array, "n_b 3"]
+    inertia: Float[Array, "n_b 3 3"]
+    parent_offset: Float[Array, "n_j 3"]
+    child_offset: Float[Array, "n_j 3"]
+    anchor: Float[Array, "n_j 3"]
+    parent_axes: Float[Array, "n_j 3 3"]
+    child_axes: Float[Array, "n_j 3 3"]
+    loop_length: Float[Array, " n_cut"]
+    length: Float[Array, ""]
+    forces: tuple[AbstractForce, ...]
+
+    @property
+    def dtype(self):
+        return self.mass.dtype
+
+    @property
+    def coordinate_units(self) -> Float[Array, " n_q"]:
+        """What one unit of each coordinate is: 1 rad, or the mechanism's length [m]."""
+        return jnp.where(self.topology.slides, self.length, jnp.ones((), self.dtype))
+
+
+def system_of(mechanism: Mechanism, dtype) -> System:
+    """Stack the numbers of a mechanism in the given floating-point type."""
+    topology, joints = mechanism.topology, mechanism.joints
+
+    def stack(entries, shape):
+        entries = [jnp.asarray(entry, dtype) for entry in entries]
+        return jnp.stack(entries) if entries else jnp.zeros((0, *shape), dtype)
+
+    frames = [joint.frames() for joint in joints]
+    parent_offset = stack([joint.parent.offset for joint in joints], (3,))
+    child_offset = stack([joint.child.offset for joint in joints], (3,))
+    parent_on_ground = (np.array(topology.parent) == GROUND_INDEX)[:, None]
+    child_on_ground = (np.array(topology.child) == GROUND_INDEX)[:, None]
+    center_of_mass = stack([body.center_of_mass for body in mechanism.bodies], (3,))
+    loop_length, length = _lengths(topology, *map(lax.stop_gradient, (parent_offset, child_offset, center_of_mass)))
+    return System(
+        topology=topology,
+        mass=stack([body.mass for body in mechanism.bodies], ()),
+        center_of_mass=center_of_mass,
+        inertia=stack([body.inertia for body in mechanism.bodies], (3, 3)),
+        parent_offset=jnp.where(parent_on_ground, 0.0, parent_offset),
+        child_offset=jnp.where(child_on_ground, 0.0, child_offset),
+        anchor=jnp.where(parent_on_ground, parent_offset, jnp.where(child_on_ground, child_offset, 0.0)),
+        parent_axes=stack([parent for parent, _ in frames], (3, 3)),
+        child_axes=stack([child for _, child in frames], (3, 3)),
+        loop_length=loop_length,
+        length=length,
+        forces=mechanism.forces,
+    )
+
+
+def _lengths(topology, parent_offset, child_offset, center_of_mass):
+    """Half the way around each loop, and the larger of these and of the reach from ground [m]."""
+    ends = jnp.concatenate([parent_offset, child_offset])  # joint j: rows j and n_j + j
+    distance = lambda pairs: jnp.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=-1)
+    around = [np.array(_stations(topology, cut)).reshape(-1, 2) for cut in range(topology.num_cuts)]
+    loop_length = jnp.stack([jnp.sum(distance(pairs)) / 2 for pairs in around]) if around else jnp.zeros(0, ends.dtype)
+
+    count = len(topology.joints)
+    moved = np.arange(topology.num_bodies)
+    near = np.where(topology.reversed, moved + count, moved)  # the end on the predecessor
+    far = np.where(topology.reversed, moved, moved + count)  # the end on the body itself
+    carrier = np.array(topology.predecessor)
+    link = jnp.where(carrier == GROUND_INDEX, 0.0, distance(np.stack([near, far[carrier]], axis=-1)))
+    to_mass = jnp.linalg.norm(center_of_mass - ends[far], axis=-1)
+    reach = jnp.asarray(topology.path[:-1], ends.dtype) @ link + to_mass
+    length = jnp.max(jnp.concatenate([loop_length, reach]))
+    length = jnp.where(length > 0.0, length, 1.0)
+    return jnp.where(loop_length > 0.0, loop_length, length), length
+
+
+def _stations(topology, cut):
+    """For each body of a loop, ground included, the two joint ends it holds (rows of `ends`)."""
+    count, joint = len(topology.joints), topology.num_bodies + cut
+    members = [*np.flatnonzero(topology.loop[cut]), joint]
+    held = {}
+    for member in members:
+        held.setdefault(topology.parent[member], []).append(member)
+        held.setdefault(topology.child[member], []).append(member + count)
+    return [pair for pair in held.values() if len(pair) == 2]

@@ -1,0 +1,1 @@
+"""From equations to accelerations and corrections: the paper's method."""

@@ -1,0 +1,1 @@
+"""Numbers only, no mechanics: pivoted QR, and the constrained solve with its derivative."""

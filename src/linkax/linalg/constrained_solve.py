@@ -1,0 +1,146 @@
+"""The constrained solve M a = f + Jᵀλ, J a = γ, for any rank of J, and its derivative.
+
+A column-pivoted QR of the metric-weighted Jacobian's transpose splits the space of speeds into a
+normal space, which the constraints decide, and a tangent space, which the dynamics decide. From
+it follow the four blocks of the saddle-point system's inverse, a = T f + G γ, λ = S γ − Gᵀ f,
+which serve accelerations and corrections alike.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float, Int
+
+from linkax.linalg.pivoted_qr import pivoted_qr
+
+
+class Inverse(NamedTuple):
+    """The inverse of [[W, -Jᵀ], [J, 0]] on the independent rows of J.
+
+    - `tangent` T (n, n), `normal` G (n, m), `compliance` S (m, m).
+    - `basis`: tangent space, (n, n), zero columns where the normal space is.
+    - `rank`: number of independent rows.
+    - `distance`: smallest over largest diagonal of R among them; small near a singular
+      configuration. One without rows.
+    """
+
+    tangent: Float[Array, "n n"]
+    normal: Float[Array, "n m"]
+    compliance: Float[Array, "m m"]
+    basis: Float[Array, "n n"]
+    rank: Int[Array, ""]
+    distance: Float[Array, ""]
+
+
+def invert(weight, jacobian, units, tolerance) -> Inverse:
+    """Split the space of speeds by J and invert the saddle-point system on it.
+
+    **Arguments:**
+
+    - `weight`: M for the mass metric, positive definite on the tangent space, (n, n); or None
+      for the identity metric, which measures speeds by their units.
+    - `jacobian`: J, (m, n), of any rank, redundant and zero rows included.
+    - `units`: one unit of each speed, (n,), so that radians and metres compare.
+    - `tolerance`: τ; a row is independent where |R_kk| > τ max(|R₁₁|, 1).
+    """
+    weight, jacobian, units = lax.stop_gradient((weight, jacobian, units))
+    rows, n = jacobian.shape
+    dtype, jacobian = jacobian.dtype, jacobian * units[None, :]
+    size = jnp.sqrt(jnp.sum(jacobian**2, axis=1))
+    added = jnp.zeros(rows, dtype)
+    to_metric = jnp.eye(n, dtype=dtype)
+    if weight is not None:
+        weight = weight * units[:, None] * units[None, :]
+        # W = M + JᵀDJ is positive definite where M is so on the tangent space only.
+        added = _ratio(jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1), size**4, 0.0)
+        to_metric = _lower_inverse(weight + (jacobian.T * added) @ jacobian)
+    if rows == 0:
+        tangent, nothing = to_metric.T * units[:, None], jnp.zeros((n, 0), dtype)
+        return Inverse(tangent @ tangent.T, nothing, nothing[:0], tangent, jnp.zeros((), int), jnp.ones((), dtype))
+
+    weighted = to_metric @ jacobian.T
+    scale = _ratio(size, jnp.sqrt(jnp.sum(weighted**2, axis=0)), 1.0)
+    q, r, order = pivoted_qr(weighted * scale)
+    count = min(n, rows)
+    diagonal = jnp.abs(jnp.diagonal(r))
+    active = diagonal > tolerance * jnp.maximum(diagonal[0], 1.0)
+    identity = jnp.eye(count, dtype=dtype)
+    triangle = jnp.where(active[:, None] & active[None, :], r[:, :count][:count], identity)
+    # Undo the permutation and the scale of the rows, and the units of the speeds.
+    chosen = order[:count]
+    on_rows = jnp.where(active[:, None], solve_triangular(triangle, identity), 0.0) * scale[chosen][:, None]
+    rows_inverse = jnp.zeros((rows, count), dtype).at[chosen].set(on_rows, unique_indices=True)
+    basis = units[:, None] * (to_metric.T @ q)
+    is_normal = jnp.zeros(n, bool).at[:count].set(active)
+    tangent = jnp.where(is_normal, 0.0, basis)
+    smallest = jnp.min(jnp.where(active, diagonal, jnp.inf))
+    return Inverse(
+        tangent=tangent @ tangent.T,
+        normal=jnp.where(is_normal, basis, 0.0)[:, :count] @ rows_inverse.T,
+        compliance=rows_inverse @ rows_inverse.T - jnp.diag(added),
+        basis=tangent,
+        rank=jnp.sum(active),
+        distance=jnp.where(active[0], _ratio(smallest, diagonal[0], 1.0), 1.0),
+    )
+
+
+def with_mass(inverse: Inverse, mass) -> Inverse:
+    """The inverse for another mass matrix on the same split: M needs to be definite on T alone."""
+    mass = lax.stop_gradient(mass)
+    basis = inverse.basis
+    empty = jnp.diag((jnp.sum(basis**2, axis=0) == 0.0).astype(mass.dtype))
+    root = _lower_inverse(basis.T @ mass @ basis + empty) @ basis.T
+    tangent = root.T @ root
+    normal = inverse.normal - tangent @ (mass @ inverse.normal)
+    return inverse._replace(tangent=tangent, normal=normal, compliance=inverse.normal.T @ mass @ normal)
+
+
+def _ratio(a, b, otherwise):
+    return jnp.where(b > 0.0, a / jnp.where(b > 0.0, b, 1.0), otherwise)
+
+
+def _lower_inverse(matrix):
+    """L⁻¹ of a positive definite matrix L Lᵀ."""
+    lower = jnp.linalg.cholesky(matrix, symmetrize_input=False)
+    return solve_triangular(lower, jnp.eye(matrix.shape[0], dtype=matrix.dtype), lower=True)
+
+
+def apply(inverse: Inverse, f, gamma):
+    """(a, λ) for the system that was inverted."""
+    a = inverse.tangent @ f + inverse.normal @ gamma
+    return a, inverse.compliance @ gamma - inverse.normal.T @ f
+
+
+def constrained_solve(inverse: Inverse, mass, jacobian, f, gamma, sweeps: int = 1):
+    """Solve M a = f + Jᵀλ, J a = γ, differentiably in M, J, f and γ, in both modes, to any order.
+
+    `inverse` is that of a system nearby, or of this one; each sweep of iterative refinement
+    multiplies the error by the distance between the two. Derivatives are solves of the same
+    system with the right-hand sides df − dM a + dJᵀλ and dγ − dJ a; nothing is differentiated
+    through the pivoting. They hold where the rank of J does not change.
+
+    **Returns:** a, (n,), and λ, (m,), zero on dependent rows.
+    """
+
+    def residual_form(unknowns):
+        a, multipliers = unknowns
+        return mass @ a - jacobian.T @ multipliers, jacobian @ a
+
+    def solve(_, right):
+        f, gamma = right
+        a, multipliers = apply(inverse, f, gamma)
+        for _ in range(sweeps):
+            force, rate = residual_form((a, multipliers))
+            correction, change = apply(inverse, f - force, gamma - rate)
+            a, multipliers = a + correction, multipliers + change
+        return a, multipliers
+
+    def transpose_solve(_, right):
+        # The transpose of [[M, -Jᵀ], [J, 0]] differs by the signs of its second row and column.
+        force, rate = right
+        a, multipliers = solve(None, (force, -rate))
+        return a, -multipliers
+
+    return lax.custom_linear_solve(residual_form, (f, gamma), solve, transpose_solve)

@@ -1,0 +1,1 @@
+"""What a scene is: bodies, joints, forces, and the mechanism they form."""

@@ -1,0 +1,163 @@
+"""Rigid bodies and the frames on them."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from linkax.model.numbers import Constant, known, number, require, rotation_matrix, value
+
+GROUND_NAME = "ground"
+
+
+class Frame(eqx.Module):
+    """A frame fixed to a body, from `body.at(...)`.
+
+    - `body`: the name of the body.
+    - `offset`: origin of the frame in the body's reference frame [m], shape (3,).
+    - `rotation`: axes of the frame as columns, in the body's axes, shape (3, 3).
+    """
+
+    body: str = eqx.field(static=True)
+    offset: Float[Array, "3"]
+    rotation: Constant | Float[Array, "3 3"]
+
+
+class Ground(eqx.Module):
+    """The fixed world, body `lx.GROUND`: joints start from it, nothing moves it."""
+
+    @property
+    def name(self) -> str:
+        return GROUND_NAME
+
+    def at(self, offset, rotation=None) -> Frame:
+        """A frame fixed to the ground: origin `offset` [m] and axes `rotation` in world axes."""
+        return Frame(
+            GROUND_NAME,
+            number(offset, (3,), "offset of a frame on the ground"),
+            rotation_matrix(rotation, "rotation of a frame on the ground"),
+        )
+
+
+GROUND = Ground()
+
+
+class RigidBody(eqx.Module):
+    """A rigid body, described in its own reference frame.
+
+    **Arguments:**
+
+    - `name`: unique in the mechanism.
+    - `mass`: [kg], zero or more.
+    - `center_of_mass`: [m], shape (3,).
+    - `inertia`: inertia tensor about the centre of mass [kg m²], shape (3, 3), or its
+      diagonal, shape (3,).
+    - `frames`: named points, `{"tip": [x, y, z]}` [m], to be used as `body.at("tip")`.
+
+    **Raises:** `ValueError` for a negative or non-finite mass, and for a tensor that no body
+    can have (asymmetric, a negative principal moment, or one larger than the sum of the others).
+    """
+
+    name: str = eqx.field(static=True)
+    mass: Float[Array, ""]
+    center_of_mass: Float[Array, "3"]
+    inertia: Float[Array, "3 3"]
+    frames: dict[str, Float[Array, "3"]]
+
+    def __init__(self, name, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(0.0, 0.0, 0.0), frames=None):
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"body name is {name!r}; give a non-empty string")
+        if name == GROUND_NAME:
+            raise ValueError(f"body {name!r}: this name belongs to lx.GROUND; choose another")
+        self.name = name
+        self.mass = require(
+            number(mass, (), f"body {name!r}: mass [kg]"),
+            lambda kilograms: kilograms >= 0.0,
+            f"body {name!r}: mass [kg]",
+            "it must be zero or more",
+        )
+        self.center_of_mass = number(center_of_mass, (3,), f"body {name!r}: center_of_mass [m]")
+        self.inertia = _inertia_tensor(inertia, f"body {name!r}: inertia [kg m²]")
+        self.frames = {
+            label: number(offset, (3,), f"body {name!r}: frame {label!r} [m]")
+            for label, offset in (frames or {}).items()
+        }
+
+    def at(self, where, rotation=None) -> Frame:
+        """A frame on this body: at a named frame or at an offset [m], with axes `rotation`.
+
+        **Arguments:**
+
+        - `where`: a name in `frames`, or [x, y, z] in the body's reference frame [m].
+        - `rotation`: axes of the frame as columns, in the body's axes (default: parallel).
+        """
+        if isinstance(where, str):
+            if where not in self.frames:
+                names = ", ".join(map(repr, self.frames)) or "none"
+                raise ValueError(
+                    f"body {self.name!r} has no frame {where!r}; its named frames: {names}; or give [x, y, z]"
+                )
+            offset = self.frames[where]
+        else:
+            offset = number(where, (3,), f"offset of a frame on body {self.name!r} [m]")
+        return Frame(self.name, offset, rotation_matrix(rotation, f"rotation of a frame on body {self.name!r}"))
+
+
+def _inertia_tensor(inertia, what):
+    diagonal = np.ndim(value(inertia)) == 1 if not hasattr(inertia, "shape") else len(inertia.shape) == 1
+    tensor = number(inertia, (3,) if diagonal else (3, 3), what)
+    if diagonal:
+        tensor = tensor * np.eye(3)
+    concrete = known(tensor)
+    if concrete is not None:
+        scale = np.max(np.abs(concrete))
+        moments = np.linalg.eigvalsh((concrete + concrete.T) / 2)
+        problem = None
+        if not np.allclose(concrete, concrete.T, rtol=0.0, atol=1e-12 * scale):
+            problem = "it must be symmetric"
+        elif moments[0] < -1e-12 * scale:
+            problem = f"its principal moments {moments.tolist()} must not be negative"
+        elif moments[2] > (moments[0] + moments[1]) * (1 + 1e-9) + 1e-12 * scale:
+            problem = (
+                f"no body has it: the largest principal moment of {moments.tolist()} exceeds the sum of the "
+                "others (triangle inequality); check units, and that it is taken about the centre of mass"
+            )
+        if problem:
+            raise ValueError(f"{what} is {concrete.tolist()}; {problem}")
+    return tensor
+
+
+def _length(length, what):
+    return require(number(length, (), what), lambda metres: metres > 0.0, what, "it must be positive")
+
+
+def rod(name: str, length, mass) -> RigidBody:
+    """A uniform slender rod along its x axis, from frame "base" (its reference) to "tip".
+
+    `length` [m], `mass` [kg]; mass × length² / 12 about the transverse axes, none about its own.
+    """
+    length = _length(length, f"rod {name!r}: length [m]")
+    mass = number(mass, (), f"body {name!r}: mass [kg]")
+    along = np.array([1.0, 0.0, 0.0])
+    return RigidBody(
+        name,
+        mass,
+        center_of_mass=length / 2 * along,
+        inertia=mass * length**2 / 12 * (1.0 - along),
+        frames={"base": 0.0 * along, "tip": length * along},
+    )
+
+
+def point_mass(name: str, mass) -> RigidBody:
+    """A mass [kg] at the origin of its frame, without rotational inertia."""
+    return RigidBody(name, mass)
+
+
+def box(name: str, size, mass) -> RigidBody:
+    """A uniform box with its centre as reference; `size` is its extent along x, y, z [m]."""
+    what = f"box {name!r}: size [m]"
+    size = require(number(size, (3,), what), lambda metres: np.all(metres > 0.0), what, "all must be positive")
+    mass = number(mass, (), f"body {name!r}: mass [kg]")
+    squares = size * size
+    xp = np if isinstance(squares, np.ndarray) else jnp
+    return RigidBody(name, mass, inertia=mass / 12 * (xp.sum(squares) - squares))

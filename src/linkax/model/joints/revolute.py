@@ -1,0 +1,31 @@
+import jax.numpy as jnp
+
+from linkax.model.joints.joint import AbstractJoint
+from linkax.spatial.rotations import rotation_about_first_axis
+
+
+class Revolute(AbstractJoint):
+    """A hinge: the child turns about h¹.
+
+    Coordinate: angle [rad] from the parent's h² to the child's, right-handed about h¹. Read
+    from a cut joint it lies in (−π, π].
+    """
+
+    coordinate_units = ("rad",)
+    angular_subspace = ((1.0, 0.0, 0.0),)
+    linear_subspace = ((0.0, 0.0, 0.0),)
+    locked_rotations = ((0, 2), (0, 1))
+    aligned_axes = (0,)
+    locked_translations = (0, 1, 2)
+
+    @staticmethod
+    def rotation(coordinates):
+        return rotation_about_first_axis(coordinates[0])
+
+    @staticmethod
+    def displacement(coordinates):
+        return jnp.zeros(3, coordinates.dtype)
+
+    @staticmethod
+    def measure(rotation, separation):
+        return jnp.arctan2(rotation[2, 1], rotation[1, 1])[None]

@@ -1,0 +1,185 @@
+"""From the graph of bodies and joints to a spanning tree and cut joints. Names and indices only."""
+
+import dataclasses
+from collections import deque
+from functools import cached_property
+
+import numpy as np
+
+from linkax.model.bodies import GROUND_NAME
+from linkax.model.joints.joint import AbstractJoint
+
+GROUND_INDEX = -1
+
+
+@dataclasses.dataclass(frozen=True)
+class Topology:
+    """The static plan of a mechanism; equal plans share their compiled programs.
+
+    Bodies are numbered from ground outwards, joint i < len(bodies) is the tree joint that
+    carries body i, and the cut joints follow. Ground has index -1.
+
+    - `predecessor`: the body that carries each body in the tree.
+    - `parent`, `child`: bodies of each joint as it was declared.
+    - `joint_types`: class of each joint.
+    - `rotation_rows`: (cut joint, i, j) of each loop row h₁ⁱ·h₂ʲ, `translation_rows`:
+      (cut joint, i) of each loop row h₁ⁱ·s; cut joints and axes counted from 0. Rows that
+      vanish identically are left out here, and kept in `immobile_rotation_rows` and
+      `immobile_translation_rows`.
+    """
+
+    bodies: tuple[str, ...]
+    joints: tuple[str, ...]
+    predecessor: tuple[int, ...]
+    parent: tuple[int, ...]
+    child: tuple[int, ...]
+    joint_types: tuple[type[AbstractJoint], ...]
+    rotation_rows: tuple[tuple[int, int, int], ...]
+    translation_rows: tuple[tuple[int, int], ...]
+    immobile_rotation_rows: tuple[tuple[int, int, int], ...]
+    immobile_translation_rows: tuple[tuple[int, int], ...]
+
+    @property
+    def num_bodies(self) -> int:
+        return len(self.bodies)
+
+    @property
+    def num_cuts(self) -> int:
+        return len(self.joints) - len(self.bodies)
+
+    @property
+    def num_rows(self) -> int:
+        return len(self.rotation_rows) + len(self.translation_rows)
+
+    @cached_property
+    def coordinates(self) -> dict[str, slice]:
+        """The coordinates of each tree joint in q, and its speeds in v."""
+        slices, start = {}, 0
+        for name, kind in zip(self.joints[: self.num_bodies], self.joint_types, strict=False):
+            slices[name] = slice(start, start + len(kind.coordinate_units))
+            start = slices[name].stop
+        return slices
+
+    @cached_property
+    def column_body(self) -> np.ndarray:
+        """The body that each speed moves directly, shape (n_v,)."""
+        counts = [len(kind.coordinate_units) for kind in self.joint_types[: self.num_bodies]]
+        return np.repeat(np.arange(self.num_bodies), counts)
+
+    @property
+    def num_coordinates(self) -> int:
+        return len(self.column_body)
+
+    @cached_property
+    def slides(self) -> np.ndarray:
+        """Which coordinates are lengths [m], shape (n_q,)."""
+        kinds = self.joint_types[: self.num_bodies]
+        return np.array([unit == "m" for kind in kinds for unit in kind.coordinate_units], dtype=bool)
+
+    @cached_property
+    def reversed(self) -> np.ndarray:
+        """Tree joints that the tree runs through from child to parent, shape (n_b,)."""
+        return np.array(self.predecessor) == np.array(self.child[: self.num_bodies])
+
+    @cached_property
+    def path(self) -> np.ndarray:
+        """path[i, j] = 1 where body j lies on the way from ground to body i, itself included.
+
+        Row -1, a row of zeros, is ground. Shape (n_b + 1, n_b).
+        """
+        path = np.zeros((self.num_bodies + 1, self.num_bodies))
+        for body, carrier in enumerate(self.predecessor):
+            path[body] = path[carrier]
+            path[body, body] = 1.0
+        return path
+
+    @cached_property
+    def loop(self) -> np.ndarray:
+        """+1 for tree joints from the loop's common ancestor to the cut joint's child, -1 to its parent."""
+        cuts = slice(self.num_bodies, None)
+        return self.path[list(self.child[cuts])] - self.path[list(self.parent[cuts])]
+
+    @cached_property
+    def root(self) -> np.ndarray:
+        """The first body on the way from ground to each body, -1 for ground, shape (n_b + 1,)."""
+        root = np.full(self.num_bodies + 1, GROUND_INDEX)
+        for body, carrier in enumerate(self.predecessor):
+            root[body] = body if carrier == GROUND_INDEX else root[carrier]
+        return root
+
+    def describe(self) -> str:
+        """The spanning tree and the cut joints, a line for each joint."""
+        lines = []
+        for index, name in enumerate(self.joints):
+            ends = [
+                GROUND_NAME if end == GROUND_INDEX else self.bodies[end]
+                for end in (self.parent[index], self.child[index])
+            ]
+            role = "tree" if index < self.num_bodies else "cut"
+            lines.append(f"{role:4} {self.joint_types[index].__name__} {name!r}: {ends[0]} - {ends[1]}")
+        return "\n".join(lines)
+
+
+def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: set[str]):
+    """Choose the tree: breadth first from ground, joints named in `first` before all others.
+
+    **Returns:** the names of the bodies from ground outwards, the tree joint and the
+    predecessor of each, and the cut joints.
+
+    **Raises:** `ValueError` for a body that no joint connects to ground, and for a joint with
+    `cut=True` that closes no loop.
+    """
+    ranked = _by_rank([joint for joint in joints if not joint.cut], first)
+    cluster = {name: name for name in [GROUND_NAME, *bodies]}
+
+    def find(name):
+        while cluster[name] != name:
+            name = cluster[name]
+        return name
+
+    tree = []
+    for joint in ranked:
+        ends = find(joint.parent.body), find(joint.child.body)
+        if ends[0] != ends[1]:
+            cluster[ends[0]] = ends[1]
+            tree.append(joint)
+    for joint in joints:
+        if joint.cut and find(joint.parent.body) != find(joint.child.body):
+            raise ValueError(f"joint {joint.name!r}: cut=True, but it closes no loop; remove cut=True")
+    loose = [name for name in bodies if find(name) != find(GROUND_NAME)]
+    if loose:
+        names = ", ".join(map(repr, loose))
+        raise ValueError(f"no joint connects {names} to ground; join each to lx.GROUND or to a body that is joined")
+    order, carriers, predecessors = _from_ground(tree)
+    in_tree = {joint.name for joint in carriers}
+    return order, carriers, predecessors, [joint for joint in joints if joint.name not in in_tree]
+
+
+def _neighbours(joints):
+    neighbours = {}
+    for joint in joints:
+        neighbours.setdefault(joint.parent.body, []).append((joint, joint.child.body))
+        neighbours.setdefault(joint.child.body, []).append((joint, joint.parent.body))
+    return neighbours
+
+
+def _by_rank(joints, first):
+    """Those named in `first`, then those of the breadth-first tree, then the rest."""
+    _, carriers, _ = _from_ground(joints)
+    nearest = {joint.name for joint in carriers}
+    return sorted(joints, key=lambda joint: (joint.name not in first, joint.name not in nearest))
+
+
+def _from_ground(joints):
+    """Walk the joints breadth first: bodies in order, the joint and the body that led to each."""
+    neighbours, queue = _neighbours(joints), deque([GROUND_NAME])
+    reached, carriers, predecessors = {GROUND_NAME: None}, [], []
+    while queue:
+        body = queue.popleft()
+        for joint, other in neighbours.get(body, []):
+            if other not in reached:
+                reached[other] = None
+                carriers.append(joint)
+                predecessors.append(body)
+                queue.append(other)
+    return list(reached)[1:], carriers, predecessors

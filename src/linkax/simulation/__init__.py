@@ -1,0 +1,1 @@
+"""Assembly of consistent states, integration in time, and the solution."""

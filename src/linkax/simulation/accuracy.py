@@ -1,0 +1,70 @@
+"""The one dial between speed and accuracy."""
+
+from typing import Literal, get_args
+
+import equinox as eqx
+import numpy as np
+
+from linkax.formulations.tangent_space import TangentSpace
+
+Projection = Literal["both", "stage", "step", "none"]
+Metric = Literal["mass", "identity"]
+
+
+class Accuracy(eqx.Module):
+    """How accurately to integrate, and how to keep the loops closed.
+
+    **Arguments:**
+
+    - `rtol`: tolerance of one step for speeds, relative to the largest speed in the mechanism.
+    - `atol`: tolerance of one step for coordinates, in radians and in lengths of the mechanism,
+      and the floor of the tolerance for speeds. Default: `rtol`.
+    - `projection`: where the state is put back on the closed loops: in every evaluation of the
+      equations of motion ("stage"), after every accepted step ("step"), "both" (default), or
+      "none". Saved states are corrected always.
+    - `rank_tolerance`: τ; a loop row counts as independent where |R_kk| > τ max(|R₁₁|, 1).
+      Default: 1e-10 in double, 1e-5 in single precision.
+    - `metric`: "mass" (default) or "identity", see `linkax.TangentSpace`.
+
+    **Raises:** `ValueError` for a tolerance that is not a positive, finite number.
+    """
+
+    rtol: np.ndarray
+    atol: np.ndarray
+    rank_tolerance: np.ndarray | None
+    projection: Projection = eqx.field(static=True)
+    metric: Metric = eqx.field(static=True)
+
+    def __init__(self, rtol=1e-8, atol=None, *, projection="both", rank_tolerance=None, metric="mass"):
+        self.rtol = _positive("rtol", rtol)
+        self.atol = self.rtol if atol is None else _positive("atol", atol)
+        self.rank_tolerance = None if rank_tolerance is None else _positive("rank_tolerance", rank_tolerance)
+        self.projection = _one_of("projection", projection, get_args(Projection))
+        self.metric = _one_of("metric", metric, get_args(Metric))
+
+    def method(self, dtype) -> TangentSpace:
+        """The paper's method at this accuracy, for numbers of the given type."""
+        default = 1e-10 if np.finfo(dtype).bits == 64 else 1e-5
+        tolerance = default if self.rank_tolerance is None else self.rank_tolerance
+        return TangentSpace(np.asarray(tolerance, dtype), self.metric)
+
+
+def _positive(name, value):
+    try:
+        number = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} is {value!r}; it must be a number") from error
+    if number.shape != () or not (np.isfinite(number) and number > 0.0):
+        raise ValueError(f"{name} is {value!r}; it must be one positive, finite number, such as 1e-8")
+    return number
+
+
+def _one_of(name, value, choices):
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}; known: {', '.join(map(repr, choices))}")
+    return value
+
+
+DRAFT = Accuracy(rtol=1e-4)
+BALANCED = Accuracy(rtol=1e-8)
+PRECISE = Accuracy(rtol=1e-12)

@@ -1,0 +1,21 @@
+"""How a simulation ended."""
+
+import diffrax
+
+
+class RESULTS(diffrax.RESULTS):
+    """`diffrax.RESULTS`, and what can go wrong with a mechanism."""
+
+    not_closed = (
+        "The loops of the initial state do not close. Make the state with `linkax.assemble`, which says which "
+        "joint is open, and how far."
+    )
+    not_finite = "The initial state or the numbers of the mechanism are not finite."
+
+
+class SimulationError(RuntimeError):
+    """A simulation that did not reach its end; `solution` holds the part computed."""
+
+    def __init__(self, message, solution):
+        super().__init__(message)
+        self.solution = solution

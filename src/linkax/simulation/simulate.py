@@ -1,0 +1,255 @@
+"""Integration of a mechanism's motion in time."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.equations.kinematics import configure
+from linkax.equations.loops import cut_frames, gaps
+from linkax.equations.system import system_of
+from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import known
+from linkax.simulation.accuracy import BALANCED, Accuracy
+from linkax.simulation.integration import MechanismControl, Problem, Projected
+from linkax.simulation.results import RESULTS, SimulationError
+from linkax.simulation.solution import Solution
+from linkax.simulation.state import State
+
+DEFAULT_SAVES = 201
+DEFAULT_MAX_STEPS = 16**4
+_SAVE_STATE = diffrax.SubSaveAt(t1=True).fn
+
+
+def simulate(
+    mechanism: Mechanism,
+    state: State,
+    *,
+    t1,
+    t0=0.0,
+    accuracy: Accuracy = BALANCED,
+    saveat: diffrax.SaveAt | None = None,
+    solver: diffrax.AbstractSolver | None = None,
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    dt0=None,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    event: diffrax.Event | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    dtype=None,
+    throw: bool = True,
+) -> Solution:
+    """Integrate the motion of a mechanism from a state at t0 to t1 [s].
+
+    **Arguments:**
+
+    - `mechanism`, `state`: see `linkax.Mechanism`, `linkax.assemble`. The state is moved onto
+      the closed loops first.
+    - `accuracy`: tolerances and projection, `linkax.DRAFT`, `BALANCED` (default), `PRECISE`, or
+      an `Accuracy` of one's own.
+    - `saveat`: as in diffrax; default 201 times, evenly from t0 to t1. What is saved lies on the
+      closed loops. A `fn` of its own gets (t, state, mechanism), the `State` closed.
+    - `solver`: a diffrax solver, default `Dopri8`.
+    - `stepsize_controller`: replaces rtol and atol of `accuracy`. It sees coordinates in radians
+      and lengths of the mechanism, each of magnitude one, and speeds relative to the largest.
+    - `adjoint`: `RecursiveCheckpointAdjoint` (default) for reverse mode, `diffrax.ForwardMode()`
+      for forward mode.
+    - `event`: as in diffrax; condition functions get (t, state, mechanism).
+    - `dtype`: floating-point type of the whole computation, default double precision.
+    - `dt0`, `max_steps`, `progress_meter`: as in diffrax.
+    - `throw`: raise where the run fails. Inside JAX transformations nothing is raised, and
+      `solution.result` alone tells.
+
+    **Returns:** a `Solution`.
+
+    **Raises:** `ValueError` for bad arguments; `SimulationError`, which holds the `.solution` so
+    far, where the run ends early: loops that do not close, numbers that are not finite,
+    `max_steps` reached, a step size that falls to nothing.
+    """
+    dtype = jnp.dtype(float if dtype is None else dtype)
+    t0, t1 = _time("t0", t0), _time("t1", t1)
+    if known(t0) is not None and known(t1) is not None and not t1 > t0:
+        raise ValueError(f"t1 is {t1} s, t0 is {t0} s; t1 must be larger")
+    _check_state(mechanism, state)
+    if not isinstance(accuracy, Accuracy):
+        raise ValueError(f"accuracy is {accuracy!r}; give linkax.DRAFT, BALANCED, PRECISE or linkax.Accuracy(rtol=...)")
+    if stepsize_controller is None:
+        stepsize_controller = diffrax.PIDController(rtol=accuracy.rtol, atol=accuracy.atol)
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    solution = _simulate(
+        mechanism,
+        state,
+        t0,
+        t1,
+        dt0 if dt0 is None else np.asarray(dt0, dtype=np.float64),
+        accuracy,
+        saveat,
+        Projected.around(diffrax.Dopri8() if solver is None else solver, accuracy, adjoint),
+        MechanismControl(_traced_tolerances(stepsize_controller)),
+        adjoint,
+        event,
+        diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
+        max_steps,
+        dtype,
+    )
+    if throw and known(solution.ts) is not None:
+        _raise_if_failed(solution)
+    return solution
+
+
+def _time(name, entry):
+    array = jnp.asarray(entry, dtype=float) if isinstance(entry, jax.Array) else np.asarray(entry, dtype=np.float64)
+    if array.shape != () or (known(array) is not None and not np.isfinite(known(array))):
+        raise ValueError(f"{name} is {entry!r}; it must be one finite number of seconds")
+    return array
+
+
+def _check_state(mechanism, state):
+    topology = mechanism.topology
+    for what, array in (("q", state.q), ("v", state.v)):
+        if jnp.shape(array) != (topology.num_coordinates,):
+            raise ValueError(
+                f"state.{what} has shape {jnp.shape(array)}; this mechanism's tree has {topology.num_coordinates} "
+                "coordinates: make the state with linkax.assemble"
+            )
+        for name, taken in topology.coordinates.items():
+            if known(array) is not None and not np.all(np.isfinite(known(array)[taken])):
+                raise ValueError(f"state.{what} of joint {name!r} is {known(array)[taken].tolist()}; it must be finite")
+
+
+def _traced_tolerances(controller):
+    """Tolerances given as Python floats made arrays, so that another value compiles nothing anew."""
+
+    def replace(path, leaf):
+        named = path and getattr(path[-1], "name", None) in ("rtol", "atol")
+        if not (named and isinstance(leaf, (int, float))):
+            return leaf
+        if not (np.isfinite(leaf) and leaf >= 0.0):
+            raise ValueError(f"stepsize_controller: {path[-1].name} is {leaf}; it must be a positive, finite number")
+        return np.asarray(leaf, dtype=np.float64)
+
+    return jax.tree_util.tree_map_with_path(replace, controller)
+
+
+class _OnManifold(eqx.Module):
+    """A user's function of (t, state, mechanism), for diffrax: the state is closed first."""
+
+    function: callable
+
+    def __call__(self, t, y, problem, **unused):
+        return self.function(t, State(*problem.close(y)), problem.mechanism)
+
+
+def _wrapped_saves(subs):
+    is_sub = lambda node: isinstance(node, diffrax.SubSaveAt)
+    wrap = lambda sub: eqx.tree_at(lambda s: s.fn, sub, _OnManifold(_state_itself if sub.fn is _SAVE_STATE else sub.fn))
+    return jax.tree.map(wrap, subs, is_leaf=is_sub)
+
+
+def _state_itself(t, state, mechanism):
+    return state
+
+
+def _wrapped_event(event):
+    if event is None:
+        return None
+    return eqx.tree_at(lambda e: e.cond_fn, event, jax.tree.map(_OnManifold, event.cond_fn, is_leaf=callable))
+
+
+def _cast(tree, dtype):
+    floating = lambda leaf: eqx.is_inexact_array(leaf)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if floating(leaf) else leaf, tree)
+
+
+@eqx.filter_jit
+def _simulate(
+    mechanism,
+    state,
+    t0,
+    t1,
+    dt0,
+    accuracy,
+    saveat,
+    solver,
+    controller,
+    adjoint,
+    event,
+    progress_meter,
+    max_steps,
+    dtype,
+):
+    mechanism, state, t0, t1, dt0, saveat, controller = _cast(
+        (mechanism, state, t0, t1, dt0, saveat, controller), dtype
+    )
+    problem = Problem(mechanism, system_of(mechanism, dtype), accuracy.method(dtype), accuracy.projection)
+    if saveat is None:
+        saveat = diffrax.SaveAt(ts=jnp.linspace(t0, t1, DEFAULT_SAVES, dtype=dtype))
+    plain = isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is _SAVE_STATE
+    subs = saveat.subs if plain else _wrapped_saves(saveat.subs)
+    saveat = eqx.tree_at(
+        lambda s: s.subs, saveat, (subs, diffrax.SubSaveAt(t1=True)), is_leaf=lambda leaf: leaf is None
+    )
+    start = problem.close((state.q, state.v))
+    gap = gaps(cut_frames(configure(problem.system, start[0])))
+    found = diffrax.diffeqsolve(
+        diffrax.ODETerm(_derivative),
+        solver,
+        t0,
+        t1,
+        dt0,
+        start,
+        problem,
+        saveat=saveat,
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        event=_wrapped_event(event),
+        max_steps=max_steps,
+        throw=False,
+        progress_meter=progress_meter,
+    )
+    (ts, _), (ys, (q_end, v_end)) = found.ts, found.ys
+    q_end, v_end = problem.close((q_end[0], v_end[0]))
+    q = v = None
+    if plain:
+        q, v = jax.vmap(lambda q, v: problem.close((q, v)))(*ys)
+        saved = jnp.isfinite(ts)[:, None]
+        q, v, ys = jnp.where(saved, q, jnp.inf), jnp.where(saved, v, jnp.inf), None
+    return Solution(
+        mechanism=mechanism,
+        accuracy=accuracy,
+        ts=ts,
+        q=q,
+        v=v,
+        ys=ys,
+        t_end=found.ts[1][0],
+        end=State(q_end, v_end),
+        stats=found.stats,
+        result=_result(found.result, start, gap, problem.system, controller),
+        interpolation=found.interpolation,
+    )
+
+
+def _derivative(t, y, problem):
+    return problem.derivative(t, y)
+
+
+def _result(result, start, gap, system, controller):
+    result = RESULTS.promote(result)
+    tolerance = jnp.sqrt(jnp.finfo(system.dtype).eps)
+    closed = jnp.all(gap.distance <= tolerance * system.length) & jnp.all(gap.angle <= tolerance)
+    finite = jnp.all(jnp.isfinite(start[0])) & jnp.all(jnp.isfinite(start[1]))
+    result = RESULTS.where(closed, result, RESULTS.not_closed)
+    return RESULTS.where(finite, result, RESULTS.not_finite)
+
+
+def _raise_if_failed(solution):
+    okay = (solution.result == RESULTS.successful) | (solution.result == RESULTS.event_occurred)
+    failed = ~np.asarray(okay)
+    if not np.any(failed):
+        return
+    member = "" if failed.ndim == 0 else f" (member {np.argwhere(failed)[0].tolist()} of the batch)"
+    index = tuple(np.argwhere(failed)[0])
+    time = float(np.asarray(solution.t_end)[index])
+    reason = RESULTS[jax.tree.map(lambda leaf: np.asarray(leaf)[index], solution.result)]
+    raise SimulationError(f"simulation stopped at t = {time:.6g} s{member}: {reason}", solution)

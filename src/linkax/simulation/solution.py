@@ -1,0 +1,275 @@
+"""The motion that a simulation found, and what can be read from it."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
+from linkax.equations.kinematics import configure, move
+from linkax.equations.loops import cut_frames, immobile_residual, jacobian, residual
+from linkax.equations.reactions import Reaction, reactions
+from linkax.equations.system import System, system_of
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import number
+from linkax.simulation.accuracy import Accuracy
+from linkax.simulation.results import RESULTS
+from linkax.simulation.state import State, joint_coordinates
+from linkax.spatial.rotations import cross, rotate
+
+
+class Violation(NamedTuple):
+    """Largest violation of the loop rows, at each time or over the run.
+
+    - `position`: c, rotation rows [rad], translation rows in lengths of the loop.
+    - `velocity`: J v [1/s]. `acceleration`: J v̇ − γ [1/s²].
+    """
+
+    position: Float[Array, "..."]
+    velocity: Float[Array, "..."]
+    acceleration: Float[Array, "..."]
+
+
+class _Instant(NamedTuple):
+    """One saved time of a solution."""
+
+    system: System
+    method: TangentSpace
+    t: Float[Array, ""]
+    q: Float[Array, " n_q"]
+    v: Float[Array, " n_v"]
+
+    @property
+    def configuration(self):
+        return configure(self.system, self.q)
+
+    @property
+    def motion(self):
+        return move(self.configuration, self.v)
+
+    @property
+    def dynamics(self):
+        return self.method.dynamics(self.system, self.t, self.q, self.v)
+
+
+class Solution(eqx.Module):
+    """A motion at the times `ts` [s].
+
+    - `q`, `v`: coordinates and speeds of the tree's joints, (n_t, n_q) and (n_t, n_v), on the
+      closed loops. Times that were not reached hold infinity.
+    - `ys`: what a `SaveAt` with functions of its own saved; `q` and `v` are None then.
+    - `t_end`, `end`: the time reached and the `State` there.
+    - `stats`: as in diffrax: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `result`: a `linkax.RESULTS`; equal to `RESULTS.successful` where all went well.
+
+    All that is read by the methods below comes as arrays with times as the first axis, in ground
+    axes and SI units. A solution from `jax.vmap` has the batch axes before that.
+    """
+
+    mechanism: Mechanism
+    accuracy: Accuracy
+    ts: Float[Array, "*batch n_t"]
+    q: Float[Array, "*batch n_t n_q"] | None
+    v: Float[Array, "*batch n_t n_v"] | None
+    ys: Any
+    t_end: Float[Array, "*batch"]
+    end: State
+    stats: dict[str, Any]
+    result: RESULTS
+    interpolation: Any
+
+    def position(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+        """Position of a body's centre of mass, or of the point `at` on it [m].
+
+        `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m].
+        """
+        return _over_times(_position, self, self._body(body), self._point(body, at))
+
+    def velocity(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+        """Velocity of a body's centre of mass, or of the point `at` on it [m/s]."""
+        return _over_times(_velocity, self, self._body(body), self._point(body, at))
+
+    def acceleration(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+        """Acceleration of a body's centre of mass, or of the point `at` on it [m/s²]."""
+        return _over_times(_acceleration, self, self._body(body), self._point(body, at))
+
+    def orientation(self, body: str) -> Float[Array, "*batch n_t 3 3"]:
+        """Axes of a body's reference frame, as columns."""
+        return _over_times(_orientation, self, self._body(body))
+
+    def angular_velocity(self, body: str) -> Float[Array, "*batch n_t 3"]:
+        """Angular velocity of a body [rad/s]."""
+        return _over_times(_angular_velocity, self, self._body(body))
+
+    def joint(self, name: str) -> Float[Array, "..."]:
+        """Coordinate of a joint, in the tree or cut [rad or m]; (n_t, n) where it has several."""
+        return self._joint(_joint, name)
+
+    def joint_speed(self, name: str) -> Float[Array, "..."]:
+        """Speed of a joint, in the tree or cut [rad/s or m/s]."""
+        return self._joint(_joint_speed, name)
+
+    def reaction(self, joint: str) -> Reaction:
+        """What a joint does to its child: `force` [N], `moment` about the child's frame [N m]."""
+        self.mechanism.joint(joint)
+        return _over_times(_reaction, self, self.mechanism.topology.joints.index(joint))
+
+    def energy(self) -> Float[Array, "*batch n_t"]:
+        """Kinetic plus potential energy [J]."""
+        return self.kinetic_energy() + self.potential_energy()
+
+    def kinetic_energy(self) -> Float[Array, "*batch n_t"]:
+        """Kinetic energy [J]."""
+        return _over_times(_kinetic_energy, self)
+
+    def potential_energy(self) -> Float[Array, "*batch n_t"]:
+        """Potential energy of the force elements that have one [J]."""
+        return _over_times(_potential_energy, self)
+
+    def violation(self) -> Violation:
+        """Largest violation of the loop rows at each time."""
+        return _over_times(_violation, self)
+
+    def worst_violation(self) -> Violation:
+        """Over all times, relative: to the run's largest speed and acceleration where those apply.
+
+        Positions count in radians and lengths of the loop, speeds and accelerations of the
+        joints in radians and lengths of the mechanism.
+        """
+        violation, (speed, acceleration) = self.violation(), _over_times(_largest, self)
+        largest = lambda values: jnp.max(jnp.where(jnp.isfinite(self.ts), values, 0.0), axis=-1)
+        relative = lambda values, scale: values / jnp.where(scale > 0.0, scale, 1.0)
+        return Violation(
+            largest(violation.position),
+            relative(largest(violation.velocity), largest(speed)),
+            relative(largest(violation.acceleration), largest(acceleration)),
+        )
+
+    def rank(self) -> Int[Array, "*batch n_t"]:
+        """Number of independent loop rows."""
+        return _over_times(_rank, self)
+
+    def evaluate(self, t) -> State:
+        """The state at a time [s] between the steps; needs `saveat=SaveAt(dense=True)`."""
+        if self.interpolation is None:
+            raise ValueError("evaluate needs a dense solution; simulate with saveat=diffrax.SaveAt(dense=True)")
+        return _evaluate(self, t)
+
+    def _body(self, name):
+        self.mechanism.body(name)
+        return self.mechanism.topology.bodies.index(name)
+
+    def _point(self, body, at):
+        found = self.mechanism.body(body)
+        if at is None:
+            return found.center_of_mass
+        if isinstance(at, str):
+            return found.at(at).offset
+        offset = number(at, (3,), f"point on body {body!r} [m]")
+        return jnp.broadcast_to(offset, (*self.ts.shape[:-1], 3))
+
+    def _joint(self, function, name):
+        count = self.mechanism.joint(name).num_coordinates
+        values = _over_times(function, self, name)
+        return values[..., 0] if count == 1 else values
+
+
+@eqx.filter_jit
+def _over_times(function, solution, *details):
+    """Evaluate a function of an instant at all times of all members of a batch."""
+    if solution.q is None:
+        raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
+
+    def of_member(solution, *details):
+        system = system_of(solution.mechanism, solution.q.dtype)
+        method = solution.accuracy.method(solution.q.dtype)
+        of_time = lambda t, q, v: function(_Instant(system, method, t, q, v), *details)
+        return jax.vmap(of_time)(solution.ts, solution.q, solution.v)
+
+    for _ in range(solution.ts.ndim - 1):
+        of_member = eqx.filter_vmap(of_member)
+    return of_member(solution, *details)
+
+
+@eqx.filter_jit
+def _evaluate(solution, t):
+    dtype = solution.end.q.dtype
+    system = system_of(solution.mechanism, dtype)
+    q, v = solution.interpolation.evaluate(jnp.asarray(t, dtype))
+    return State(*solution.accuracy.method(dtype).close(system, q, v))
+
+
+def _arm(configuration, body, point):
+    return rotate(configuration.rotation[body], point)
+
+
+def _position(instant, body, point):
+    configuration = instant.configuration
+    return configuration.world_position()[body] + _arm(configuration, body, point)
+
+
+def _velocity(instant, body, point):
+    motion = instant.motion
+    arm = _arm(motion.configuration, body, point)
+    return motion.velocity[body] + cross(motion.angular_velocity[body], arm)
+
+
+def _acceleration(instant, body, point):
+    motion = instant.motion
+    arm, omega = _arm(motion.configuration, body, point), motion.angular_velocity[body]
+    angular, linear = body_accelerations(motion, instant.dynamics.acceleration)
+    return linear[body] + cross(angular[body], arm) + cross(omega, cross(omega, arm))
+
+
+def _orientation(instant, body):
+    return instant.configuration.rotation[body]
+
+
+def _angular_velocity(instant, body):
+    return instant.motion.angular_velocity[body]
+
+
+def _joint(instant, name):
+    return joint_coordinates(instant.system, name, instant.q)
+
+
+def _joint_speed(instant, name):
+    return jax.jvp(lambda q: joint_coordinates(instant.system, name, q), (instant.q,), (instant.v,))[1]
+
+
+def _reaction(instant, joint):
+    motion, dynamics = instant.motion, instant.dynamics
+    cuts = cut_frames(motion.configuration)
+    found = reactions(instant.t, motion, cuts, dynamics.acceleration, dynamics.multipliers)
+    return Reaction(found.force[joint], found.moment[joint])
+
+
+def _kinetic_energy(instant):
+    return kinetic_energy(instant.motion)
+
+
+def _potential_energy(instant):
+    return potential_energy(instant.configuration)
+
+
+def _violation(instant):
+    cuts = cut_frames(instant.configuration)
+    position = jnp.concatenate([residual(cuts), immobile_residual(cuts)])
+    return Violation(*map(_size, (position, jacobian(cuts) @ instant.v, instant.dynamics.violation)))
+
+
+def _size(rows):
+    return jnp.max(jnp.abs(rows), initial=0.0)
+
+
+def _largest(instant):
+    units = instant.system.coordinate_units
+    return _size(instant.v / units), _size(instant.dynamics.acceleration / units)
+
+
+def _rank(instant):
+    return instant.dynamics.rank

@@ -1,0 +1,1 @@
+"""Geometry: rotations and vector products. No mechanics."""

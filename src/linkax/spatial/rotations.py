@@ -1,0 +1,65 @@
+"""Rotations as 3x3 matrices whose columns are the rotated axes."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+COORDINATE_AXES = {
+    sign + name: (1.0 if sign == "" else -1.0) * np.eye(3)[index]
+    for index, name in enumerate("xyz")
+    for sign in ("", "-")
+}
+
+
+def cross(a, b):
+    """Vector product along the last axis, shape (..., 3)."""
+    return jnp.stack(
+        [
+            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
+            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
+            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
+        ],
+        axis=-1,
+    )
+
+
+def dot(a, b):
+    """Scalar product along the last axis, shape (...)."""
+    return jnp.sum(a * b, axis=-1)
+
+
+def rotate(rotation, vector):
+    """Rotate vectors (..., 3) by rotations (..., 3, 3)."""
+    return jnp.sum(rotation * vector[..., None, :], axis=-1)
+
+
+def compose(first, second):
+    """Product of rotations (..., 3, 3): `second` is applied first to a vector."""
+    return jnp.sum(first[..., :, :, None] * second[..., None, :, :], axis=-2)
+
+
+def transpose(rotation):
+    """Inverse of a rotation, shape (..., 3, 3)."""
+    return jnp.swapaxes(rotation, -1, -2)
+
+
+def rotation_about_first_axis(angle) -> Float[Array, "3 3"]:
+    """Rotation by `angle` [rad] about the first axis."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+    return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
+
+
+def frame_about_axis(axis):
+    """A right-handed frame whose first axis is the unit vector `axis`, shape (3, 3).
+
+    The second axis is the normalised product of the coordinate axis that is farthest from
+    `axis` (in cyclic order) with it, so coordinate axes give coordinate frames. NumPy in
+    gives NumPy out.
+    """
+    xp = np if isinstance(axis, np.ndarray) else jnp
+    index = xp.argmax(xp.abs(axis))
+    helper = xp.eye(3)[(index + 2) % 3]
+    second = xp.cross(helper, axis)
+    second = second / xp.sqrt(xp.sum(second * second))
+    return xp.stack([axis, second, xp.cross(axis, second)], axis=-1)
