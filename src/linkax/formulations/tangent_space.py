@@ -106,6 +106,7 @@ class TangentSpace(eqx.Module):
         v = self._on_velocity_level(system, instant, v, split, sweeps=2)
         return q, v, instant, split
 
+    @eqx.filter_jit  # traced once, however often a solver asks
     def correct(self, system: System, q, v):
         """q and v moved onto the manifold, for states close to it, and the distance d there."""
         if system.topology.num_rows == 0:
@@ -113,6 +114,7 @@ class TangentSpace(eqx.Module):
         q, v, _, split = self._corrected(system, q, v)
         return q, v, split.distance
 
+    @eqx.filter_jit  # traced once, however often a solver asks
     def derivative(self, system: System, t, q, v, correct: bool):
         """q̇ and v̇ at (q, v), corrected before the equations of motion are formed."""
         if correct and system.topology.num_rows > 0:
@@ -122,41 +124,65 @@ class TangentSpace(eqx.Module):
         split = self._split(system, instant)
         return v, self._dynamics(system, t, instant, v, split, sweeps=1).acceleration
 
+    @eqx.filter_jit
     def dynamics(self, system: System, t, q, v) -> Dynamics:
         """Accelerations and multipliers at a state on the manifold."""
         instant = _at(system, q)
         return self._dynamics(system, t, instant, v, self._split(system, instant), sweeps=1)
 
+    @eqx.filter_jit
     def close(self, system: System, q, v):
         """q and v on the manifold to rounding, from any state near it, with fresh factors."""
         if system.topology.num_rows == 0:
             return q, v
-        closed = lax.stop_gradient(self._closed(*lax.stop_gradient((system, q))))
-        # One more step carries the derivative: nearest to q on the loops linearised where they close.
-        instant = _at(system, closed)
-        split = self._split(system, instant)
-        weight = self._weight(system, instant)
-        gap = -residual(instant.cuts)
-        q = closed + constrained_solve(split, weight, instant.jacobian, weight @ (q - closed), gap)[0]
-        instant = _at(system, q)
-        return q, self._on_velocity_level(system, instant, v, self._split(system, instant), sweeps=1)
+        return _close((self, system, q, v))
 
-    def _closed(self, system, q):
-        """Newton steps until the loops close to rounding or stop closing further."""
+    def _approach(self, system, q, v):
+        """Newton steps on q until the loops close to rounding or stop closing further, then v."""
         small = ROUNDING_ULPS * jnp.finfo(q.dtype).eps
 
         def unfinished(carry):
-            count, _, gap, best = carry
-            return (count < MOST_CORRECTIONS) & (gap > small) & (gap < best)
+            count, _, _, gap, before = carry
+            return (count < MOST_CORRECTIONS) & (gap > small) & (gap < before)
 
         def improve(carry):
-            count, q, gap, _ = carry
+            count, q, _, before, _ = carry
             instant = _at(system, q)
-            q = q + self._step(system, instant, self._split(system, instant))
-            return count + 1, q, self._gap(system, q), gap
+            split = self._split(system, instant)
+            gap = jnp.max(jnp.abs(residual(instant.cuts)))
+            done = (gap <= small) | (gap >= before)
+            closer = jnp.where(done, q, q + self._step(system, instant, split))
+            return count + 1, closer, self._on_velocity_level(system, instant, v, split, sweeps=1), gap, before
 
-        start = (jnp.zeros((), int), q, self._gap(system, q), jnp.asarray(jnp.inf, q.dtype))
-        return lax.while_loop(unfinished, improve, start)[1]
+        far = jnp.asarray(jnp.finfo(q.dtype).max, q.dtype)
+        start = (jnp.zeros((), int), q, v, far, 2.0 * far)
+        _, q, v, _, _ = lax.while_loop(unfinished, improve, start)
+        return q, v
 
-    def _gap(self, system, q):
-        return jnp.max(jnp.abs(residual(cut_frames(configure(system, q)))))
+    def _last_step(self, system, closed, q, v):
+        """What `close` does near a closed state, as a function to be differentiated."""
+        instant = _at(system, closed)
+        split, weight = self._split(system, instant), self._weight(system, instant)
+        away = weight @ (q - closed)
+        q = closed + constrained_solve(split, weight, instant.jacobian, away, -residual(instant.cuts))[0]
+        instant = _at(system, q)
+        return q, self._on_velocity_level(system, instant, v, split, sweeps=2)
+
+
+@eqx.filter_custom_jvp
+def _close(arguments):
+    method, system, q, v = arguments
+    return method._approach(system, q, v)
+
+
+@_close.def_jvp
+def _close_jvp(primals, tangents):
+    """The nearest state on the loops, linearised where they close."""
+    (arguments,), (tangent,) = primals, tangents
+    closed = _close(arguments)
+
+    def last_step(arguments):
+        method, system, q, v = arguments
+        return method._last_step(system, closed[0], q, v)
+
+    return closed, eqx.filter_jvp(last_step, (arguments,), (tangent,))[1]

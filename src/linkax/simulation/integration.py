@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -20,6 +21,8 @@ from linkax.model.mechanism import Mechanism
 
 NOISE_FACTOR = 100.0
 LARGEST_NOISE = 1e-8
+FIRST_STEP = 1e-3  # of the whole time
+FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 SMALLEST_STEP_ULPS = 4.0
 
 
@@ -33,12 +36,28 @@ class Problem(eqx.Module):
 
     def derivative(self, t, state):
         """(q̇, v̇) for diffrax."""
-        q, v = state
-        return self.method.derivative(self.system, t, q, v, correct=self.projection in ("both", "stage"))
+        correct = self.projection in ("both", "stage")
+        return _apart(lambda q, v: self.method.derivative(self.system, t, q, v, correct), state, _undefined(state))
 
     def close(self, state):
         """The state on the manifold to rounding."""
         return self.method.close(self.system, *state)
+
+
+def _apart(function, state, otherwise):
+    """function(q, v), as a branch of its own, taken where the state is finite.
+
+    The branch is for speed: XLA runs a computation on the CPU without the cost of scheduling
+    its parts (half of the time for a small mechanism) where it touches small arrays only, and
+    inlined into a solver's step it would touch the tables of the solver.
+    """
+    q, v = state
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
+    return lax.cond(finite, function, lambda q, v: otherwise, q, v)
+
+
+def _undefined(state):
+    return jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), state)
 
 
 class StepError(NamedTuple):
@@ -93,7 +112,7 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         y1, error, dense_info, inner, result = self.solver.step(terms, t0, t1, y0, args, inner, made_jump)
         next_distance = distance
         if self.after_step:
-            q, v, next_distance = args.method.correct(args.system, *y1)
+            q, v, next_distance = _apart(lambda q, v: args.method.correct(args.system, q, v), y1, (*_undefined(y1), distance))
             y1 = (q, v)
         return y1, StepError(error, distance), dense_info, (inner, next_distance), result
 
@@ -113,6 +132,12 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         return MechanismControl(self.controller.wrap(direction))
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        if dt0 is None and isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
+            # Not diffrax's choice, which would compile the equations of motion twice more.
+            fastest = jnp.max(jnp.abs(y0[1] / args.system.coordinate_units), initial=0.0)
+            turning = jnp.where(fastest > 0.0, FIRST_TURN / jnp.where(fastest > 0.0, fastest, 1.0), jnp.inf)
+            dt0 = jnp.minimum(FIRST_STEP * (t1 - t0), turning)
+            dt0 = lax.stop_gradient(dt0)
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):

@@ -209,12 +209,13 @@ def _simulate(
         progress_meter=progress_meter,
     )
     (ts, _), (ys, (q_end, v_end)) = found.ts, found.ys
-    q_end, v_end = problem.close((q_end[0], v_end[0]))
-    q = v = None
     if plain:
-        q, v = jax.vmap(lambda q, v: problem.close((q, v)))(*ys)
-        saved = jnp.isfinite(ts)[:, None]
-        q, v, ys = jnp.where(saved, q, jnp.inf), jnp.where(saved, v, jnp.inf), None
+        every = jax.tree.map(lambda saved, end: jnp.concatenate([saved, end]), ys, (q_end, v_end))
+        q, v = jax.vmap(lambda q, v: problem.close((q, v)))(*every)
+        end, saved = State(q[-1], v[-1]), jnp.isfinite(ts)[:, None]
+        q, v, ys = jnp.where(saved, q[:-1], jnp.inf), jnp.where(saved, v[:-1], jnp.inf), None
+    else:
+        q, v, end = None, None, State(*problem.close((q_end[0], v_end[0])))
     return Solution(
         mechanism=mechanism,
         accuracy=accuracy,
@@ -223,7 +224,7 @@ def _simulate(
         v=v,
         ys=ys,
         t_end=found.ts[1][0],
-        end=State(q_end, v_end),
+        end=end,
         stats=found.stats,
         result=_result(found.result, start, gap, problem.system, controller),
         interpolation=found.interpolation,

@@ -1,0 +1,71 @@
+"""Row of N parallelogram four-bars, problem A02 of the LIM/IFToMM benchmark library.
+
+When all links lie in line the mechanism has N + 1 degrees of freedom for a moment.
+"""
+
+import math
+
+import linkax as lx
+from linkax.scenes.scene import Scene, Variant
+
+
+def _mechanism(parameters):
+    count, length, mass = parameters["N"], parameters["length"], parameters["mass"]
+    links = [lx.rod(f"link_{i}", length, mass) for i in range(count + 1)]
+    couplers = [lx.rod(f"coupler_{i}", length, mass) for i in range(1, count + 1)]
+    joints = [
+        lx.Revolute(f"pivot_{i}", lx.GROUND.at([i * length, 0.0, 0.0]), link.at("base"), axis="z")
+        for i, link in enumerate(links)
+    ]
+    for i, coupler in enumerate(couplers, start=1):
+        joints += [
+            lx.Revolute(f"left_{i}", links[i - 1].at("tip"), coupler.at("base"), axis="z"),
+            lx.Revolute(f"right_{i}", coupler.at("tip"), links[i].at("tip"), axis="z"),
+        ]
+    return lx.Mechanism([*links, *couplers], joints, [lx.Gravity([0.0, -parameters["gravity"], 0.0])])
+
+
+def _initial(mechanism, parameters):
+    """All joints are given, because a start with the links in line has other branches too."""
+    return lx.assemble(
+        mechanism,
+        positions=_parallel(parameters["N"], parameters["angle"]),
+        speeds=_parallel(parameters["N"], parameters["speed"]),
+    )
+
+
+def _parallel(count, turn):
+    """All joints where vertical links turn alike and couplers only translate."""
+    return (
+        {f"pivot_{i}": turn for i in range(count + 1)}
+        | {f"left_{i}": -turn for i in range(1, count + 1)}
+        | {f"right_{i}": turn for i in range(1, count + 1)}
+    )
+
+
+N_FOUR_BAR = Scene(
+    name="n-four-bar",
+    summary="row of N parallelogram four-bars (A02 of the LIM/IFToMM library; N = 1: example b of the paper)",
+    parameters={"N": 2, "length": 1.0, "mass": 1.0, "gravity": 9.81, "angle": math.pi / 2, "speed": -1.0},
+    meanings={
+        "N": "number of four-bars",
+        "length": "of every link [m]",
+        "mass": "of every link, a uniform slender rod [kg]",
+        "gravity": "along -y [m/s²]",
+        "angle": "of the vertical links from +x, at the start [rad]",
+        "speed": "of that angle, at the start [rad/s]; -1 moves B0 at +1 m/s where the links are upright",
+    },
+    variants={
+        "A02": Variant("upright, B0 at 1 m/s, under gravity"),
+        "FL1": Variant("one four-bar from upright, without gravity", {"N": 1, "gravity": 0.0, "speed": 1.0}),
+        "FL2": Variant(
+            "one four-bar from the singular position, without gravity",
+            {"N": 1, "gravity": 0.0, "angle": 0.0, "speed": 1.0},
+        ),
+    },
+    default_variant="A02",
+    t1=10.0,
+    mechanism=_mechanism,
+    initial=_initial,
+    points=lambda parameters: {"B0": ("link_0", "tip"), "C": ("coupler_1", "tip")},
+)

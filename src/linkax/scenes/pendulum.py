@@ -1,0 +1,38 @@
+"""Planar simple pendulum, problem A01 of the LIM/IFToMM benchmark library."""
+
+import linkax as lx
+from linkax.scenes.scene import Scene, Variant
+
+
+def _mechanism(parameters):
+    at_tip = [parameters["length"], 0.0, 0.0]
+    link = lx.RigidBody("link", parameters["mass"], center_of_mass=at_tip, frames={"bob": at_tip})
+    return lx.Mechanism(
+        bodies=[link],
+        joints=[lx.Revolute("pivot", lx.GROUND, link, axis="z")],
+        forces=[lx.Gravity([0.0, -parameters["gravity"], 0.0])],
+    )
+
+
+def _initial(mechanism, parameters):
+    return lx.assemble(mechanism, {"pivot": parameters["angle"]}, {"pivot": parameters["speed"]})
+
+
+PENDULUM = Scene(
+    name="pendulum",
+    summary="point mass on a massless link (A01 of the LIM/IFToMM library)",
+    parameters={"length": 1.0, "mass": 1.0, "gravity": 9.81, "angle": 0.0, "speed": 0.0},
+    meanings={
+        "length": "from the pivot to the mass [m]",
+        "mass": "of the bob [kg]",
+        "gravity": "along -y [m/s²]",
+        "angle": "of the link from +x, at the start [rad]",
+        "speed": "of that angle, at the start [rad/s]",
+    },
+    variants={"A01": Variant("released from rest, horizontal")},
+    default_variant="A01",
+    t1=10.0,
+    mechanism=_mechanism,
+    initial=_initial,
+    points=lambda parameters: {"bob": ("link", "bob")},
+)

@@ -1,0 +1,98 @@
+"""A long run in segments, so that its progress can be reported from the host."""
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import jax
+import numpy as np
+
+from linkax.model.mechanism import Mechanism
+from linkax.simulation.accuracy import BALANCED, Accuracy
+from linkax.simulation.results import RESULTS
+from linkax.simulation.simulate import DEFAULT_MAX_STEPS, simulate
+from linkax.simulation.solution import Solution
+from linkax.simulation.state import State
+
+SEGMENTS = 20
+DEFAULT_INTERVALS = 1000
+LONG_RUN = 2.0  # seconds
+INSTANT = 1e-6  # of the whole time
+
+
+class TimedRun(NamedTuple):
+    """A solution, and the wall time that compiling and running took [s]."""
+
+    solution: Solution
+    compile_s: float
+    run_s: float
+
+
+def simulate_in_segments(
+    mechanism: Mechanism,
+    state: State,
+    *,
+    t1: float,
+    accuracy: Accuracy = BALANCED,
+    solver: diffrax.AbstractSolver | None = None,
+    intervals: int = DEFAULT_INTERVALS,
+    report: Callable[[str, float | None], None] = lambda phase, fraction: None,
+) -> TimedRun:
+    """Integrate from 0 to t1 [s], and tell how far it is.
+
+    A run that takes long is cut into segments, each with a few steps more than an uncut run
+    needs; the first one tells whether it is worth it. All share one compiled program.
+
+    **Arguments:**
+
+    - `mechanism`, `state`, `accuracy`, `solver`: see `linkax.simulate`.
+    - `report`: called with what happens now, and with the fraction done where that is known.
+
+    **Returns:** a `TimedRun`; its solution has the default times of `linkax.simulate`, and ends
+    with the segment that failed, if one did.
+    """
+
+    def run(start, t0, end):
+        began = time.perf_counter()
+        found = simulate(mechanism, start, t0=t0, t1=end, accuracy=accuracy, solver=solver, throw=False)
+        return jax.block_until_ready(found), time.perf_counter() - began
+
+    report("compiling", None)
+    _, compile_s = run(state, 0.0, INSTANT * t1)
+    report("integrating", 0.0)
+    first, run_s = run(state, 0.0, t1 / SEGMENTS)
+    if not _is_long(first, run_s):
+        whole, run_s = run(state, 0.0, t1)
+        return TimedRun(whole, compile_s, run_s)
+    parts, borders = [first], np.linspace(0.0, t1, SEGMENTS + 1)
+    for t0, end in itertools.pairwise(borders[1:]):
+        if parts[-1].result != RESULTS.successful:
+            break
+        report("integrating", float(t0 / t1))
+        part, seconds = run(parts[-1].end, t0, end)
+        parts, run_s = [*parts, part], run_s + seconds
+    return TimedRun(_joined(parts), compile_s, run_s)
+
+
+def _is_long(first, seconds):
+    return SEGMENTS * seconds > LONG_RUN or SEGMENTS * first.stats["num_steps"] > DEFAULT_MAX_STEPS // 2
+
+
+def _joined(parts) -> Solution:
+    """One solution with as many times as a run without segments; a border belongs to the earlier one."""
+    counted = {name: sum(part.stats[name] for part in parts) for name in parts[0].stats if name != "max_steps"}
+    return dataclasses.replace(
+        parts[-1],
+        ts=_thinned(parts, "ts"),
+        q=_thinned(parts, "q"),
+        v=_thinned(parts, "v"),
+        stats=parts[-1].stats | counted,
+    )
+
+
+def _thinned(parts, name):
+    first, *others = (np.asarray(getattr(part, name)) for part in parts)
+    return np.concatenate([first[::SEGMENTS], *(values[SEGMENTS::SEGMENTS] for values in others)])
