@@ -154,8 +154,8 @@ def animate_mechanism(solution: Solution, path, points=None, dpi: int = 100) -> 
     moments = _moments(solution)
     scenery = _scenery(moments, points or {})
     figure, axes = _canvas(scenery, dpi)
+    _draw_ground(axes, scenery)
     actors = [
-        *_draw_ground(axes, scenery),
         *_draw_traces(axes, scenery),
         *_draw_slides(axes, scenery),
         *_draw_bodies(axes, scenery),
@@ -302,14 +302,13 @@ def _draw_clock(axes, times):
 
 
 def _draw_ground(axes, scenery):
-    """Ground under the hinges that rest on it, and the guides fixed to it. Nothing moves."""
+    """Ground under the hinges that rest on it, and the guides fixed to it."""
     for joint in scenery.mechanism.joints:
         for frame in (joint.parent, joint.child):
             if frame.body == GROUND_NAME and _is_hinge(joint):
                 _draw_pivot(axes, scenery.seen(GROUND_NAME, frame.offset)[0], SYMBOL_HEIGHT * scenery.unit)
             elif frame.body == GROUND_NAME and _is_slide(joint):
                 _draw_guide(axes, scenery, joint)
-    return []
 
 
 def _draw_pivot(axes, tip, size):

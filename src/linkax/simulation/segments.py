@@ -49,15 +49,25 @@ def simulate_in_segments(
     **Arguments:**
 
     - `mechanism`, `state`, `accuracy`, `solver`: see `linkax.simulate`.
+    - `intervals`: between the saved times, a multiple of 20.
     - `report`: called with what happens now, and with the fraction done where that is known.
 
-    **Returns:** a `TimedRun`; its solution has the default times of `linkax.simulate`, and ends
-    with the segment that failed, if one did.
+    **Returns:** a `TimedRun`; its solution ends with the segment that failed, if one did.
     """
 
     def run(start, t0, end):
         began = time.perf_counter()
-        found = simulate(mechanism, start, t0=t0, t1=end, accuracy=accuracy, solver=solver, throw=False)
+        times = np.linspace(t0, end, intervals + 1)
+        found = simulate(
+            mechanism,
+            start,
+            t0=t0,
+            t1=end,
+            accuracy=accuracy,
+            solver=solver,
+            saveat=diffrax.SaveAt(ts=times),
+            throw=False,
+        )
         return jax.block_until_ready(found), time.perf_counter() - began
 
     report("compiling", None)
