@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from linkax.equations.kinematics import Configuration, Motion, by_body, over_subtree
 from linkax.model.forces import Load
-from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, cross, dot, rotate, transpose
 
 

@@ -163,7 +163,9 @@ def _assemble(mechanism, positions, speeds, guess):
             q = q.at[topology.coordinates[name]].set(entry)
     placed, moving = _Demand(system, positions), _Demand(system, speeds)
     q = lax.stop_gradient(lax.stop_gradient(placed).meet(lax.stop_gradient(q)))
-    q = q + placed.least_change(q, -placed.rows(q))  # carries the derivative
+    # Carries the derivative. Loops that do not close stay as open as they were found.
+    met = placed.size(q) <= CLOSED
+    q = q + jnp.where(met, placed.least_change(q, -placed.rows(q)), 0.0)
 
     asked = jnp.concatenate([jnp.zeros(topology.num_rows), *speeds.values()])
     v = moving.least_change(q, asked)

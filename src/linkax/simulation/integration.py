@@ -112,7 +112,9 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         y1, error, dense_info, inner, result = self.solver.step(terms, t0, t1, y0, args, inner, made_jump)
         next_distance = distance
         if self.after_step:
-            q, v, next_distance = _apart(lambda q, v: args.method.correct(args.system, q, v), y1, (*_undefined(y1), distance))
+            q, v, next_distance = _apart(
+                lambda q, v: args.method.correct(args.system, q, v), y1, (*_undefined(y1), distance)
+            )
             y1 = (q, v)
         return y1, StepError(error, distance), dense_info, (inner, next_distance), result
 

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
@@ -117,6 +116,12 @@ class Solution(eqx.Module):
         """What a joint does to its child: `force` [N], `moment` about the child's frame [N m]."""
         self.mechanism.joint(joint)
         return _over_times(_reaction, self, self.mechanism.topology.joints.index(joint))
+
+    def reactions(self) -> dict[str, Reaction]:
+        """The reactions of all joints, by name."""
+        force, moment = _over_times(_reactions, self)
+        names = enumerate(self.mechanism.topology.joints)
+        return {name: Reaction(force[..., index, :], moment[..., index, :]) for index, name in names}
 
     def energy(self) -> Float[Array, "*batch n_t"]:
         """Kinetic plus potential energy [J]."""
@@ -241,10 +246,14 @@ def _joint_speed(instant, name):
     return jax.jvp(lambda q: joint_coordinates(instant.system, name, q), (instant.q,), (instant.v,))[1]
 
 
-def _reaction(instant, joint):
+def _reactions(instant):
     motion, dynamics = instant.motion, instant.dynamics
     cuts = cut_frames(motion.configuration)
-    found = reactions(instant.t, motion, cuts, dynamics.acceleration, dynamics.multipliers)
+    return reactions(instant.t, motion, cuts, dynamics.acceleration, dynamics.multipliers)
+
+
+def _reaction(instant, joint):
+    found = _reactions(instant)
     return Reaction(found.force[joint], found.moment[joint])
 
 

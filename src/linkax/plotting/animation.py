@@ -1,8 +1,4 @@
-"""Pictures of a motion: time histories as figures, and the mechanism itself as an animation.
-
-Figures are made without pyplot, so that they need no display and leave no global state:
-`plot_energy(solution).savefig("energy.png")`, or the last value of a notebook cell.
-"""
+"""The mechanism itself as an animation."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,120 +14,15 @@ from PIL import Image
 
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.mechanism import Mechanism
+from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
 from linkax.simulation.solution import Solution
 
-# Okabe and Ito's colours, told apart by colour-blind readers too.
-BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
-COMPONENT_COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
 BODY_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
-INK, FAINT = "#333333", "#9A9A9A"
-
-NEGLIGIBLE = 1e-9  # of the largest component
-SMALLEST_VIOLATION = 1e-17  # drawn in place of zero, which has no logarithm
+NEGLIGIBLE = 1e-9  # length of a direction seen from its end
 FRAMES_PER_SECOND = 25
 MOST_FRAMES = 150
 SYMBOL_HEIGHT = 1.8  # of boxes and pivots above ground, in units of a symbol
 LARGEST_TURN = 0.6  # radians of a joint between two frames; beyond, an eye loses a wheel's sense of turning
-
-
-def plot_point_motion(solution: Solution, body: str, at=None, name: str | None = None) -> Figure:
-    """Displacement [m], velocity [m/s] and acceleration [m/s²] of a point against time [s].
-
-    The point is the body's centre of mass, or `at` on it (see `Solution.position`); `name` is
-    what the title calls it. Components along ground axes in which it stays at rest are left out.
-    """
-    histories = {
-        "displacement [m]": solution.position(body, at),
-        "velocity [m/s]": solution.velocity(body, at),
-        "acceleration [m/s²]": solution.acceleration(body, at),
-    }
-    shown = _present(histories["velocity [m/s]"])
-    figure, panels = _panels(f"Motion of {name or body}{_along(shown)}", 3)
-    for panel, (label, values) in zip(panels, histories.items(), strict=True):
-        _draw_components(panel, solution.ts, values, shown)
-        panel.set_ylabel(label)
-    _add_legend(figure, panels[0])
-    return figure
-
-
-def plot_reaction(solution: Solution, joint: str) -> Figure:
-    """Force [N] of a joint on its child against time [s], along ground axes; zero components left out."""
-    force = solution.reaction(joint).force
-    child = solution.mechanism.joint(joint).child.body
-    shown = _present(force)
-    figure, (panel,) = _panels(f"Force of {joint} on {child}{_along(shown)}", 1)
-    _draw_components(panel, solution.ts, force, shown)
-    panel.set_ylabel("force [N]")
-    _add_legend(figure, panel)
-    return figure
-
-
-def plot_violations(solution: Solution) -> Figure:
-    """Largest violation of the loop rows on position, velocity and acceleration level against time [s].
-
-    See `linkax.Violation` for the units. Zeros are drawn at 1e-17.
-    """
-    figure, panels = _panels("Violation of the loops", 3)
-    levels = ("position\n[rad or loop lengths]", BLUE), ("velocity\n[1/s]", VERMILION), ("acceleration\n[1/s²]", GREEN)
-    for panel, (label, colour), values in zip(panels, levels, solution.violation(), strict=True):
-        drawn = np.maximum(np.asarray(values), SMALLEST_VIOLATION)
-        panel.semilogy(solution.ts, drawn, color=colour, linewidth=0.8)
-        panel.axhline(np.finfo(np.float64).eps, color=INK, linewidth=0.8, linestyle="--", label="rounding of 1")
-        panel.set_ylabel(label)
-    _add_legend(figure, panels[0])
-    return figure
-
-
-def plot_energy(solution: Solution) -> Figure:
-    """Kinetic, potential and total energy [J], and below the change of the total, against time [s]."""
-    kinetic, potential = np.asarray(solution.kinetic_energy()), np.asarray(solution.potential_energy())
-    total = kinetic + potential
-    figure, (energies, change) = _panels("Energy", 2)
-    for label, values, colour in (("kinetic", kinetic, BLUE), ("potential", potential, VERMILION)):
-        energies.plot(solution.ts, values, color=colour, label=label)
-    energies.plot(solution.ts, total, color=INK, label="total", linestyle="--")
-    energies.set_ylabel("energy [J]")
-    _add_legend(figure, energies)
-    change.plot(solution.ts, total - total[0], color=INK)
-    change.set_ylabel("change of\ntotal energy [J]")
-    return figure
-
-
-def _panels(title, count):
-    figure = Figure(figsize=(7.0, 1.2 + 1.9 * count if count > 1 else 3.8), layout="constrained")
-    panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    panels[0].set_title(title)
-    panels[-1].set_xlabel("time [s]")
-    for panel in panels:
-        panel.grid(True, color="#E5E5E5")
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.margins(x=0.0)
-    return figure, panels
-
-
-def _present(values):
-    """Names of the components that are not negligible; all of them where all are zero."""
-    sizes = np.max(np.abs(np.asarray(values)), axis=0)
-    present = [name for name, size in zip("xyz", sizes, strict=True) if size > NEGLIGIBLE * max(sizes)]
-    return present or list("xyz")
-
-
-def _draw_components(panel, times, values, names):
-    for index, (name, colour) in enumerate(COMPONENT_COLOURS.items()):
-        if name in names:
-            panel.plot(times, np.asarray(values)[:, index], color=colour, label=name)
-
-
-def _along(names):
-    """Words for the title: with one component there, no legend is needed."""
-    return f" along {names[0]}" if len(names) == 1 else ""
-
-
-def _add_legend(figure, panel):
-    handles, labels = panel.get_legend_handles_labels()
-    if handles[1:] or labels[0] not in COMPONENT_COLOURS:
-        figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), frameon=False)
-    figure.align_ylabels()
 
 
 def animate_mechanism(solution: Solution, path, points=None, dpi: int = 100) -> None:
@@ -165,7 +56,9 @@ def animate_mechanism(solution: Solution, path, points=None, dpi: int = 100) -> 
     frames = _filmed(figure, axes, actors, len(moments.ts))
     # One palette for all frames: colours do not flicker, and the file is small.
     frames = [frame.quantize(palette=frames[0].quantize(128), dither=Image.Dither.NONE) for frame in frames]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 // FRAMES_PER_SECOND, loop=0)
+    frames[0].save(
+        path, format="GIF", save_all=True, append_images=frames[1:], duration=1000 // FRAMES_PER_SECOND, loop=0
+    )
 
 
 class _Actor(NamedTuple):

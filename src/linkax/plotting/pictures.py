@@ -1,0 +1,39 @@
+"""All pictures of a run, as files."""
+
+from pathlib import Path
+
+import numpy as np
+
+from linkax.plotting import animate_mechanism, plot_energy, plot_point_motion, plot_reaction, plot_violations
+from linkax.simulation.files import written_whole
+from linkax.simulation.solution import Solution
+
+
+def write_pictures(solution: Solution, points, folder: Path) -> list[Path]:
+    """Write the pictures of a run, of the times it reached, and return their paths.
+
+    The motion of each named point (Fig. 8 of the paper for the crank-slider's slider),
+    violations (Fig. 10), the reaction of each joint on ground (Fig. 11 for its guide), energy,
+    and the animation `mechanism.gif`.
+    """
+    figures = {f"motion_{name}": plot_point_motion(solution, body, at, name) for name, (body, at) in points.items()}
+    figures |= {"violations": plot_violations(solution), "energy": plot_energy(solution)}
+    for joint in solution.mechanism.joints:
+        if joint.name in _on_ground(solution.mechanism):
+            figures[f"reaction_{joint.name}"] = plot_reaction(solution, joint.name)
+    written = []
+    for name, figure in figures.items():
+        with written_whole(folder / f"{name}.png") as path:
+            figure.savefig(path, dpi=130, format="png")
+        written.append(folder / f"{name}.png")
+    if np.sum(np.isfinite(np.asarray(solution.ts))) > 1:
+        with written_whole(folder / "mechanism.gif") as path:
+            animate_mechanism(solution, path, points)
+        written.append(folder / "mechanism.gif")
+    return written
+
+
+def _on_ground(mechanism) -> set[str]:
+    topology = mechanism.topology
+    ends = zip(topology.joints, topology.parent, topology.child, strict=True)
+    return {name for name, parent, child in ends if -1 in (parent, child)}

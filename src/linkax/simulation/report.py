@@ -1,0 +1,82 @@
+"""A run in numbers: what is printed of it, and what is kept."""
+
+import numpy as np
+
+from linkax.simulation.results import RESULTS
+from linkax.simulation.segments import TimedRun
+from linkax.simulation.solution import Solution
+
+
+def result_name(result) -> str:
+    """The name of a result, such as "successful" or "max_steps_reached"."""
+    for name in ("successful", "max_steps_reached", "dt_min_reached", "event_occurred", "not_closed", "not_finite"):
+        if bool(result == getattr(RESULTS, name)):
+            return name
+    return "failed"
+
+
+def summary(run: TimedRun, points) -> dict:
+    """Steps, times, violations, energy error, rank, result and final positions of a run.
+
+    Violations are relative (`Solution.worst_violation`); `energy_error` is the largest change of
+    the energy over the largest kinetic energy, or in joules where nothing moves. What is not
+    finite is None.
+    """
+    solution = run.solution
+    reached = np.isfinite(np.asarray(solution.ts))
+    violation = solution.worst_violation()
+    energy, kinetic = np.asarray(solution.energy())[reached], np.asarray(solution.kinetic_energy())[reached]
+    rank = np.asarray(solution.rank())[reached]
+    drift, scale = np.max(np.abs(energy - energy[:1]), initial=0.0), np.max(kinetic, initial=0.0)
+    last = np.flatnonzero(reached)[-1] if np.any(reached) else 0
+    return {
+        "steps": int(solution.stats["num_steps"]),
+        "rejected_steps": int(solution.stats["num_rejected_steps"]),
+        "compile_s": run.compile_s,
+        "run_s": run.run_s,
+        "position_violation": _finite(violation.position),
+        "velocity_violation": _finite(violation.velocity),
+        "acceleration_violation": _finite(violation.acceleration),
+        "energy_error": _finite(drift / scale if scale > 0.0 else drift),
+        "rank_min": int(np.min(rank, initial=rank[0] if len(rank) else 0)),
+        "rank_max": int(np.max(rank, initial=0)),
+        "result": result_name(solution.result),
+        "message": "" if result_name(solution.result) == "successful" else str(RESULTS[solution.result]),
+        "t_end": _finite(solution.t_end),
+        "final": {
+            name: [_finite(part) for part in np.asarray(solution.position(body, at))[last]]
+            for name, (body, at) in points.items()
+        },
+    }
+
+
+def _finite(number):
+    return float(number) if np.isfinite(number) else None
+
+
+def trajectory(solution: Solution, points) -> dict[str, np.ndarray]:
+    """Arrays for an NPZ file, times first, SI units, ground axes.
+
+    - `t`; `q`, `v` and `coordinates`: coordinates and speeds of the tree's joints, and whose
+      each is; `energy`; `rank`; `position_violation`, `velocity_violation`,
+      `acceleration_violation` as in `linkax.Violation`.
+    - `position_NAME`, `velocity_NAME`, `acceleration_NAME` of each named point.
+    - `force_NAME`, `moment_NAME`: reaction of each joint on its child.
+    """
+    slices = solution.mechanism.topology.coordinates
+    kept = {
+        "t": solution.ts,
+        "q": solution.q,
+        "v": solution.v,
+        "coordinates": [name for name, taken in slices.items() for _ in range(taken.stop - taken.start)],
+        "energy": solution.energy(),
+        "rank": solution.rank(),
+    }
+    kept |= {f"{level}_violation": values for level, values in solution.violation()._asdict().items()}
+    for name, (body, at) in points.items():
+        kept[f"position_{name}"] = solution.position(body, at)
+        kept[f"velocity_{name}"] = solution.velocity(body, at)
+        kept[f"acceleration_{name}"] = solution.acceleration(body, at)
+    for joint, reaction in solution.reactions().items():
+        kept[f"force_{joint}"], kept[f"moment_{joint}"] = reaction
+    return {name: np.asarray(values) for name, values in kept.items()}

@@ -1,0 +1,89 @@
+"""Consistent states from partial positions and speeds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+
+
+def crank_slider(crank=1.0, rod=1.0, cut=None):
+    arm = lx.rod("crank", length=crank, mass=1.0)
+    link = lx.rod("rod", length=rod, mass=1.0)
+    slider = lx.point_mass("slider", mass=1.0)
+    options = lambda name: {"cut": True} if name == cut else {}
+    return lx.Mechanism(
+        [arm, link, slider],
+        [
+            lx.Revolute("bearing", lx.GROUND, arm.at("base"), axis="z", **options("bearing")),
+            lx.Revolute("crank_pin", arm.at("tip"), link.at("base"), axis="z", **options("crank_pin")),
+            lx.Revolute("wrist_pin", link.at("tip"), slider, axis="z", **options("wrist_pin")),
+            lx.Prismatic("guide", lx.GROUND, slider, axis="x", **options("guide")),
+        ],
+    )
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi / 4, 1.0, -1.2])
+def test_equal_lengths_find_the_sliding_branch(angle):
+    mechanism = crank_slider()
+    state = lx.assemble(mechanism, {"bearing": angle}, {"bearing": 2.0})
+    place = mechanism.topology.coordinates
+    np.testing.assert_allclose(state.q[place["guide"]], 2 * np.cos(angle), atol=1e-12)
+    np.testing.assert_allclose(state.v[place["guide"]], -4 * np.sin(angle), atol=1e-12)
+
+
+def test_a_cut_joint_is_held_as_well_as_one_in_the_tree():
+    held_in_tree = lx.assemble(crank_slider(rod=1.5), {"bearing": 0.4}, {"guide": 1.0})
+    cut = crank_slider(rod=1.5, cut="guide")
+    distance = held_in_tree.q[crank_slider(rod=1.5).topology.coordinates["guide"]][0]
+    held_where_cut = lx.assemble(cut, {"guide": distance}, {"guide": 1.0}, guess={"bearing": 0.3, "crank_pin": -0.5})
+    place = cut.topology.coordinates
+    np.testing.assert_allclose(held_where_cut.q[place["bearing"]], 0.4, atol=1e-12)
+    np.testing.assert_allclose(
+        held_where_cut.v[place["bearing"]],
+        held_in_tree.v[crank_slider().topology.coordinates["bearing"]],
+        atol=1e-12,
+    )
+
+
+def test_the_guess_chooses_the_assembly_mode():
+    folded = lx.assemble(crank_slider(rod=1.5), {"bearing": 0.4}, guess={"guide": -1.0, "crank_pin": 3.0})
+    place = crank_slider().topology.coordinates
+    assert folded.q[place["guide"]][0] < 0.0
+
+
+def test_a_loop_that_cannot_close_names_joint_and_gap():
+    with pytest.raises(
+        lx.AssemblyError, match=r"joint 'wrist_pin' does not close: a gap of 0\.\d+ m remains.*'bearing'"
+    ):
+        lx.assemble(crank_slider(rod=0.5), {"bearing": np.pi / 2})
+
+
+def test_contradicting_positions_and_speeds():
+    with pytest.raises(lx.AssemblyError, match="does not close|is missed by"):
+        lx.assemble(crank_slider(), {"bearing": 0.3, "guide": 0.2})
+    with pytest.raises(lx.AssemblyError, match="speed asked of joint 'bearing' is missed"):
+        lx.assemble(crank_slider(), {"bearing": 0.3}, {"bearing": 1.0, "guide": 5.0})
+
+
+def test_unknown_names_and_wrong_numbers():
+    with pytest.raises(ValueError, match="unknown joint 'pin'; known"):
+        lx.assemble(crank_slider(), {"pin": 1.0})
+    with pytest.raises(ValueError, match="position of joint 'bearing' is"):
+        lx.assemble(crank_slider(), {"bearing": float("nan")})
+    with pytest.raises(ValueError, match="guess for joint 'wrist_pin', which is cut"):
+        lx.assemble(crank_slider(), guess={"wrist_pin": 1.0})
+
+
+def test_derivative_of_an_assembled_state():
+    def distance(crank, rod, angle):
+        return lx.assemble(crank_slider(crank, rod), {"bearing": angle}, {"bearing": 1.0}).q[1]
+
+    exact = lambda crank, rod, angle: crank * jnp.cos(angle) + jnp.sqrt(rod**2 - (crank * jnp.sin(angle)) ** 2)
+    numbers = (1.0, 1.5, 0.7)
+    found, known = jax.grad(distance, (0, 1, 2))(*numbers), jax.grad(exact, (0, 1, 2))(*numbers)
+    np.testing.assert_allclose(found, known, rtol=1e-12)
+    speed = lambda *numbers: lx.assemble(crank_slider(*numbers[:2]), {"bearing": numbers[2]}, {"bearing": 1.0}).v[1]
+    known = jax.grad(lambda crank, rod, angle: jax.grad(exact, 2)(crank, rod, angle), (0, 1, 2))(*numbers)
+    np.testing.assert_allclose(jax.grad(speed, (0, 1, 2))(*numbers), known, rtol=1e-10)

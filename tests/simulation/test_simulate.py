@@ -1,0 +1,178 @@
+"""What simulate accepts, refuses, compiles, and returns."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+from linkax.scenes import SCENES
+
+
+def pendulum(length=1.0, forces=()):
+    link = lx.RigidBody("link", 1.0, center_of_mass=[length, 0.0, 0.0], frames={"bob": [length, 0.0, 0.0]})
+    joints = [lx.Revolute("pivot", lx.GROUND, link, axis="z")]
+    return lx.Mechanism([link], joints, [lx.Gravity([0.0, -9.81, 0.0]), *forces])
+
+
+class CountingTorque(lx.AbstractForce):
+    """A torque that counts how often it is traced."""
+
+    traces = 0
+    torque: jax.Array
+
+    def load(self, t, motion):
+        CountingTorque.traces += 1
+        none = lx.Load.none(motion.system)
+        return none._replace(joint_force=self.torque + none.joint_force)
+
+
+def test_other_numbers_compile_nothing_anew():
+    def run(length, torque, angle, t1, rtol):
+        mechanism = pendulum(length, [CountingTorque(jnp.asarray(torque))])
+        state = lx.assemble(mechanism, {"pivot": angle})
+        lx.simulate(mechanism, state, t1=t1, accuracy=lx.Accuracy(rtol=rtol))
+        controller = diffrax.PIDController(rtol=rtol, atol=rtol)
+        lx.simulate(mechanism, state, t1=t1, stepsize_controller=controller)
+
+    run(1.0, 0.1, 0.2, 1.0, 1e-6)
+    traces = CountingTorque.traces
+    assert traces > 0
+    run(1.3, 0.2, 0.4, 2.0, 1e-7)
+    assert CountingTorque.traces == traces
+
+
+def test_a_batch_equals_single_runs():
+    lengths = jnp.array([0.7, 1.0, 1.6])
+
+    def run(length):
+        mechanism = pendulum(length)
+        return lx.simulate(mechanism, lx.assemble(mechanism, {"pivot": 0.3}), t1=1.0)
+
+    batch = jax.vmap(run)(lengths)
+    position, energy = batch.position("link", at="bob"), batch.energy()
+    assert position.shape == (3, 201, 3)
+    for member, length in enumerate(lengths):
+        single = run(length)
+        np.testing.assert_allclose(position[member], single.position("link", at="bob"), atol=1e-10)
+        np.testing.assert_allclose(energy[member], single.energy(), atol=1e-9)
+    assert batch.worst_violation().position.shape == (3,)
+
+
+def test_a_member_that_fails_is_marked_and_harms_no_other():
+    def run(angle):
+        mechanism = pendulum()
+        return lx.simulate(mechanism, lx.State(jnp.array([1.0]) * angle, jnp.zeros(1)), t1=1.0)
+
+    batch = jax.vmap(run)(jnp.array([0.3, jnp.nan, 0.5]))
+    assert (batch.result == lx.RESULTS.successful).tolist() == [True, False, True]
+    assert (batch.result == lx.RESULTS.not_finite).tolist() == [False, True, False]
+    np.testing.assert_allclose(batch.q[0], run(0.3).q, atol=1e-10)
+
+
+def test_max_steps_keeps_the_part_computed():
+    mechanism = pendulum()
+    state = lx.assemble(mechanism, {"pivot": 0.3})
+    with pytest.raises(lx.SimulationError, match=r"stopped at t = .* s: .*max_steps") as failure:
+        lx.simulate(mechanism, state, t1=100.0, max_steps=64)
+    solution = failure.value.solution
+    assert solution.result == lx.RESULTS.max_steps_reached
+    reached = np.isfinite(solution.ts)
+    assert 1 < np.sum(reached) < 201
+    assert 0.0 < solution.t_end < 100.0
+    whole = lx.simulate(mechanism, state, t1=100.0)
+    np.testing.assert_allclose(solution.q[reached], whole.q[reached], atol=1e-12)
+
+
+def test_a_state_that_does_not_close_is_refused():
+    scene = SCENES["crank-slider"]
+    mechanism = scene.mechanism(scene.settings(changes={"rod": 0.2}))
+    with pytest.raises(lx.SimulationError, match=r"loops of the initial state do not close.*assemble"):
+        lx.simulate(mechanism, lx.State(jnp.array([1.5, 0.5, 0.5]), jnp.zeros(3)), t1=5.0)
+
+
+@pytest.mark.parametrize("rtol", [0.0, -1e-6, float("nan"), float("inf"), "tight"])
+def test_bad_tolerances(rtol):
+    with pytest.raises(ValueError, match="rtol is"):
+        lx.Accuracy(rtol=rtol)
+
+
+@pytest.mark.parametrize(("option", "value"), [("projection", "often"), ("metric", "euclid")])
+def test_unknown_options_of_accuracy(option, value):
+    with pytest.raises(ValueError, match=f"{option} is '{value}'; known"):
+        lx.Accuracy(**{option: value})
+
+
+@pytest.mark.parametrize("t1", [-1.0, 0.0, float("nan"), float("inf")])
+def test_bad_end_times(t1):
+    mechanism = pendulum()
+    with pytest.raises(ValueError, match="t1"):
+        lx.simulate(mechanism, lx.assemble(mechanism), t1=t1)
+
+
+def test_bad_states():
+    mechanism = pendulum()
+    with pytest.raises(ValueError, match=r"state.q of joint 'pivot' is \[nan\]"):
+        lx.simulate(mechanism, lx.State(jnp.array([jnp.nan]), jnp.zeros(1)), t1=1.0)
+    with pytest.raises(ValueError, match=r"state.v has shape \(2,\).*assemble"):
+        lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(2)), t1=1.0)
+
+
+def test_single_precision_throughout():
+    mechanism = pendulum()
+    state = lx.assemble(mechanism, {"pivot": 0.3})
+    single = lx.simulate(mechanism, state, t1=1.0, dtype=jnp.float32, accuracy=lx.Accuracy(rtol=1e-5))
+    assert single.q.dtype == single.v.dtype == single.ts.dtype == jnp.float32
+    assert single.position("link").dtype == jnp.float32
+    np.testing.assert_allclose(single.q, lx.simulate(mechanism, state, t1=1.0).q, atol=1e-4)
+
+
+def test_functions_of_a_user_see_a_closed_state():
+    mechanism = pendulum()
+    state = lx.assemble(mechanism, {"pivot": 0.3})
+    saved = diffrax.SaveAt(ts=jnp.linspace(0.0, 1.0, 5), fn=lambda t, state, mechanism: state.q[0])
+    event = diffrax.Event(lambda t, state, mechanism, **kwargs: state.q[0] < 0.0)
+    found = lx.simulate(mechanism, state, t1=1.0, saveat=saved)
+    np.testing.assert_allclose(found.ys, lx.simulate(mechanism, state, t1=1.0).q[::50, 0], atol=1e-7)
+    with pytest.raises(ValueError, match="saved functions of its own"):
+        found.position("link")
+    stopped = lx.simulate(mechanism, state, t1=10.0, event=event)
+    assert stopped.result == lx.RESULTS.event_occurred
+    assert stopped.t_end < 1.0
+
+
+def test_dense_solutions_are_closed_between_steps():
+    mechanism = pendulum()
+    state = lx.assemble(mechanism, {"pivot": 0.3})
+    dense = lx.simulate(mechanism, state, t1=1.0, saveat=diffrax.SaveAt(dense=True), max_steps=512)
+    plain = lx.simulate(mechanism, state, t1=1.0)
+    np.testing.assert_allclose(dense.evaluate(plain.ts[77]).q, plain.q[77], atol=1e-8)
+    with pytest.raises(ValueError, match=r"SaveAt\(dense=True\)"):
+        plain.evaluate(0.5)
+
+
+def test_unknown_names_in_accessors():
+    mechanism = pendulum()
+    found = lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0)
+    with pytest.raises(ValueError, match="unknown body 'crank'; known: 'link'"):
+        found.position("crank")
+    with pytest.raises(ValueError, match="unknown joint 'pin'; known: 'pivot'"):
+        found.reaction("pin")
+    with pytest.raises(ValueError, match="body 'link' has no frame 'tip'"):
+        found.position("link", at="tip")
+
+
+def test_hanging_pendulum_reaction_is_its_weight():
+    mechanism = pendulum()
+    found = lx.simulate(mechanism, lx.assemble(mechanism, {"pivot": -np.pi / 2}), t1=1.0)
+    force, moment = found.reaction("pivot")
+    np.testing.assert_allclose(force[-1], [0.0, 9.81, 0.0], atol=1e-9)
+    np.testing.assert_allclose(moment[-1], 0.0, atol=1e-9)
+
+
+def test_solutions_are_pytrees():
+    mechanism = pendulum()
+    found = lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0)
+    assert all(eqx.is_array_like(leaf) for leaf in jax.tree.leaves(found) if not callable(leaf))
