@@ -57,13 +57,13 @@ def test_a_loop_that_cannot_close_names_joint_and_gap():
     with pytest.raises(
         lx.AssemblyError, match=r"joint 'wrist_pin' does not close: a gap of 0\.\d+ m remains.*'bearing'"
     ):
-        lx.assemble(crank_slider(rod=0.5), {"bearing": np.pi / 2})
+        lx.assemble(crank_slider(rod=0.5), {"bearing": 1.2})
 
 
 def test_contradicting_positions_and_speeds():
-    with pytest.raises(lx.AssemblyError, match="does not close|is missed by"):
+    with pytest.raises(lx.AssemblyError, match=r"does not close|is missed by"):
         lx.assemble(crank_slider(), {"bearing": 0.3, "guide": 0.2})
-    with pytest.raises(lx.AssemblyError, match="speed asked of joint 'bearing' is missed"):
+    with pytest.raises(lx.AssemblyError, match=r"speed asked of joint '(bearing|guide)' is missed"):
         lx.assemble(crank_slider(), {"bearing": 0.3}, {"bearing": 1.0, "guide": 5.0})
 
 

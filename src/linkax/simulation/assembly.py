@@ -130,10 +130,19 @@ class _Demand(eqx.Module):
         return constrained_solve(inverse, jnp.diag(units**-2), rows, jnp.zeros_like(q), right)[0]
 
     def size(self, q):
-        return jnp.max(jnp.abs(self.rows(q)), initial=0.0)
+        rows = self.rows(q)
+        return jnp.sqrt(jnp.sum(rows * rows))
+
+    def descent(self, q):
+        """The steepest descent of the rows' squares, as long as their linearisation says."""
+        units, rows, slopes = self.system.coordinate_units, self.rows(q), self.jacobian(q)
+        downhill = -(units**2) * (rows @ slopes)
+        change = slopes @ downhill
+        scale = jnp.sum(change * change)
+        return downhill * jnp.where(scale > 0.0, -(rows @ change) / jnp.where(scale > 0.0, scale, 1.0), 0.0)
 
     def meet(self, q):
-        """Damped Newton steps from q until the rows vanish or stop falling."""
+        """Damped Newton steps from q until the rows vanish or stop falling; descent where those fail."""
 
         def unfinished(carry):
             count, _, size, before = carry
@@ -141,10 +150,11 @@ class _Demand(eqx.Module):
 
         def improve(carry):
             count, q, size, _ = carry
-            step = self.least_change(q, -self.rows(q))
-            longest = jnp.max(jnp.abs(step / self.system.coordinate_units), initial=0.0)
-            step = step * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0))
-            tries = jnp.concatenate([q + STEP_FRACTIONS[:, None] * step, q[None]])
+            steps = jnp.stack([self.least_change(q, -self.rows(q)), self.descent(q)])
+            longest = jnp.max(jnp.abs(steps / self.system.coordinate_units), axis=1, keepdims=True, initial=0.0)
+            steps = steps * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0))
+            tries = (q + STEP_FRACTIONS[:, None, None] * steps).reshape(-1, len(q))
+            tries = jnp.concatenate([tries, q[None]])
             sizes = jax.vmap(self.size)(tries)
             best = jnp.argmin(sizes)
             return count + 1, tries[best], sizes[best], size

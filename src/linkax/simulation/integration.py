@@ -61,7 +61,11 @@ def _undefined(state):
 
 
 class StepError(NamedTuple):
-    """A step's error estimate, and d at its start (see `Inverse.distance`)."""
+    """A step's error estimate, and the smaller d of its two ends (see `Inverse.distance`).
+
+    Both ends count: at a start exactly in a singular configuration the rank is lower, and the
+    distance is that of the rows left.
+    """
 
     error: Any
     distance: Float[Array, ""]
@@ -116,7 +120,7 @@ class Projected(diffrax.AbstractAdaptiveSolver):
                 lambda q, v: args.method.correct(args.system, q, v), y1, (*_undefined(y1), distance)
             )
             y1 = (q, v)
-        return y1, StepError(error, distance), dense_info, (inner, next_distance), result
+        return y1, StepError(error, jnp.minimum(distance, next_distance)), dense_info, (inner, next_distance), result
 
 
 class MechanismControl(diffrax.AbstractStepSizeController):

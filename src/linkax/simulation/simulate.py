@@ -252,5 +252,5 @@ def _raise_if_failed(solution):
     member = "" if failed.ndim == 0 else f" (member {np.argwhere(failed)[0].tolist()} of the batch)"
     index = tuple(np.argwhere(failed)[0])
     time = float(np.asarray(solution.t_end)[index])
-    reason = RESULTS[jax.tree.map(lambda leaf: np.asarray(leaf)[index], solution.result)]
+    reason = RESULTS[jax.tree.map(lambda leaf: leaf[index], solution.result)]
     raise SimulationError(f"simulation stopped at t = {time:.6g} s{member}: {reason}", solution)
