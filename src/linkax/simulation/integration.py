@@ -159,7 +159,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             t0, t1, *scales, args, scaled, error_order, controller_state
         )
         stalled = next_t1 - next_t0 <= SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t1), 1e-3)
-        result = diffrax.RESULTS.where(stalled & ~keep, diffrax.RESULTS.dt_min_reached, result)
+        result = diffrax.RESULTS.where(stalled & jnp.logical_not(keep), diffrax.RESULTS.dt_min_reached, result)
         return keep, next_t0, next_t1, jump, controller_state, result
 
 

@@ -143,7 +143,8 @@ class Solution(eqx.Module):
         """Over all times, relative: to the run's largest speed and acceleration where those apply.
 
         Positions count in radians and lengths of the loop, speeds and accelerations of the
-        joints in radians and lengths of the mechanism.
+        joints in radians and lengths of the mechanism; the square of a speed counts as an
+        acceleration, since uniform motion of the joints accelerates the bodies.
         """
         violation, (speed, acceleration) = self.violation(), _over_times(_largest, self)
         largest = lambda values: jnp.max(jnp.where(jnp.isfinite(self.ts), values, 0.0), axis=-1)
@@ -277,7 +278,8 @@ def _size(rows):
 
 def _largest(instant):
     units = instant.system.coordinate_units
-    return _size(instant.v / units), _size(instant.dynamics.acceleration / units)
+    speed = _size(instant.v / units)
+    return speed, jnp.maximum(_size(instant.dynamics.acceleration / units), speed**2)
 
 
 def _rank(instant):

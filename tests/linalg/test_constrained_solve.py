@@ -1,0 +1,255 @@
+"""The constrained solve for any rank of J, in both metrics, and its derivatives to second order."""
+
+from typing import NamedTuple
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from linkax.linalg.constrained_solve import apply, constrained_solve, invert, with_mass
+
+TOLERANCE = 1e-10
+METRICS = ["mass", "identity"]
+UNITS = {3: np.array([1.0, 0.05, 20.0]), 5: np.array([1.0, 20.0, 1.0, 0.05, 1.0])}
+ONES = {n: np.ones(n) for n in UNITS}
+
+
+class Problem(NamedTuple):
+    """M = Pᵀ diag(m) P and J = C K, so that masses and dependent rows are chosen freely."""
+
+    shape: np.ndarray
+    masses: np.ndarray
+    combination: np.ndarray
+    rows: np.ndarray
+    force: np.ndarray
+    rate: np.ndarray
+    direction: np.ndarray
+
+
+def problem(case, seed=0):
+    rng = np.random.default_rng(seed)
+    n, m = {"more rows than columns": (3, 5), "no rows": (5, 0)}.get(case, (5, 4))
+    combination = np.eye(m)
+    if case == "redundant":
+        combination[3] = combination[0] - 2.0 * combination[1]
+    if case == "zero rows":
+        combination[[0, 2]] = 0.0
+    if case == "more rows than columns":
+        combination = rng.normal(size=(5, 2)) @ rng.normal(size=(2, 5))
+    masses = 0.5 + rng.random(n)
+    if case == "massless":
+        masses[0] = 0.0
+    return Problem(
+        shape=np.eye(n) + 0.3 * rng.normal(size=(n, n)),
+        masses=masses,
+        combination=combination,
+        rows=rng.normal(size=(m, n)),
+        force=rng.normal(size=n),
+        rate=rng.normal(size=n),
+        direction=0.2 * rng.normal(size=(2, n, n)),
+    )
+
+
+RANKS = {
+    "regular": 4,
+    "redundant": 3,
+    "zero rows": 2,
+    "massless": 4,
+    "more rows than columns": 2,
+    "no rows": 0,
+}
+
+
+def matrices(given_problem, theta):
+    """M, J, f and γ at parameters θ, (2,); the rank of J does not depend on them."""
+    p, n = given_problem, given_problem.masses.shape[0]
+    turn = jnp.tensordot(theta, p.direction, 1)
+    shape = p.shape @ (jnp.eye(n) + turn + turn @ turn)
+    mass = shape.T @ (p.masses[:, None] * (1.0 + theta[0] ** 2) * shape)
+    jacobian = (1.0 + theta[1]) * p.combination @ p.rows @ (jnp.eye(n) - turn @ turn + turn.T)
+    return mass, jacobian, p.force * (1.0 + theta[0] * theta[1]), jacobian @ (p.rate + theta[0] * p.force)
+
+
+def inverted(metric, mass, jacobian, units):
+    if metric == "mass":
+        return invert(mass, jacobian, units, TOLERANCE)
+    return with_mass(invert(None, jacobian, units, TOLERANCE), mass)
+
+
+def solved(metric, given_problem, units, theta):
+    """What is unique: a and the constraint force Jᵀλ; and λ."""
+    mass, jacobian, f, gamma = matrices(given_problem, theta)
+    a, multipliers = constrained_solve(inverted(metric, mass, jacobian, units), mass, jacobian, f, gamma)
+    return jnp.concatenate([a, jacobian.T @ multipliers]), multipliers
+
+
+answers = jax.jit(solved, static_argnums=0)
+THETA = np.array([0.1, -0.2])
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("case", RANKS)
+@settings(deadline=None, max_examples=5)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_it_solves_the_saddle_point_system(case, metric, seed):
+    chosen = problem(case, seed)
+    units = UNITS[chosen.masses.size]
+    mass, jacobian, f, gamma = map(np.asarray, matrices(chosen, THETA))
+    unique, multipliers = map(np.asarray, answers(metric, chosen, units, THETA))
+    n, m = mass.shape[0], len(jacobian)
+    saddle = np.block([[mass, -jacobian.T], [jacobian, np.zeros((m, m))]])
+    expected = np.linalg.lstsq(saddle, np.concatenate([f, gamma]), rcond=1e-10)[0]
+    # Random matrices can be ill-conditioned; nothing can be better than rounding times that.
+    values = np.linalg.svd(saddle, compute_uv=False)
+    condition = values[0] / values[values > 1e-10 * values[0]][-1]
+    atol = 1e-14 * condition * max(1.0, np.max(np.abs(expected)))
+    np.testing.assert_allclose(unique[:n], expected[:n], atol=atol)
+    np.testing.assert_allclose(unique[n:], jacobian.T @ expected[n:], atol=atol)
+    np.testing.assert_allclose(mass @ unique[:n], f + jacobian.T @ multipliers, atol=atol)
+    np.testing.assert_allclose(jacobian @ unique[:n], gamma, atol=atol)
+    assert np.sum(multipliers != 0.0) <= RANKS[case]
+
+
+@pytest.mark.parametrize("case", RANKS)
+def test_the_answer_depends_on_neither_metric_nor_units(case):
+    chosen = problem(case)
+    n = chosen.masses.size
+    found = [answers(metric, chosen, units[n], THETA)[0] for metric in METRICS for units in (UNITS, ONES)]
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-12 * np.max(np.abs(found[0])))
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("case", RANKS)
+def test_the_blocks_of_the_inverse(case, metric):
+    """T spans the tangent space, G is a right inverse of J on its range, T M G = 0."""
+    chosen = problem(case)
+    mass, jacobian, _, _ = map(np.asarray, matrices(chosen, THETA))
+    inverse = jax.tree.map(np.asarray, inverted(metric, mass, jacobian, UNITS[len(mass)]))
+    scale = np.max(np.abs(inverse.tangent))
+    np.testing.assert_allclose(inverse.tangent, inverse.tangent.T, atol=1e-13 * scale)
+    np.testing.assert_allclose(inverse.tangent @ mass @ inverse.tangent, inverse.tangent, atol=1e-12 * scale)
+    np.testing.assert_allclose(jacobian @ inverse.tangent, 0.0, atol=1e-12 * scale)
+    np.testing.assert_allclose(jacobian @ inverse.normal @ jacobian, jacobian, atol=1e-12)
+    if case != "massless":
+        np.testing.assert_allclose(inverse.tangent @ mass @ inverse.normal, 0.0, atol=1e-11 * scale)
+    assert np.linalg.matrix_rank(inverse.tangent, tol=1e-8 * scale) == len(mass) - RANKS[case]
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("case", RANKS)
+def test_rank(case, metric):
+    mass, jacobian, _, _ = matrices(problem(case), THETA)
+    assert int(inverted(metric, mass, jacobian, UNITS[len(mass)]).rank) == RANKS[case]
+
+
+def test_distance_is_the_ratio_of_the_diagonal_of_r():
+    _, jacobian, _, _ = matrices(problem("redundant"), THETA)
+    diagonal = np.abs(np.diagonal(scipy.linalg.qr(np.asarray(jacobian).T, pivoting=True)[1]))[:3]
+    inverse = invert(None, jacobian, ONES[5], TOLERANCE)
+    np.testing.assert_allclose(inverse.distance, diagonal[2] / diagonal[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("smallest", "rank"), [(1e-3, 2), (1e-9, 2), (1e-11, 1), (0.0, 1)])
+def test_distance_falls_towards_a_singular_position(smallest, rank):
+    """Rows at an angle of `smallest` to each other; one of them is dropped below the rank tolerance."""
+    jacobian = np.array([[1.0, 0.0, 0.0], [1.0, smallest, 0.0]])
+    for weight in (None, np.diag([1.0, 2.0, 3.0])):
+        inverse = invert(weight, jacobian, ONES[3], TOLERANCE)
+        assert int(inverse.rank) == rank
+        # The first row alone has distance one; in another metric the ratio changes by that metric's.
+        assert smallest / 3 <= float(inverse.distance) <= 3 * smallest or (rank == 1 and inverse.distance == 1.0)
+
+
+def test_without_independent_rows_nothing_is_constrained():
+    mass = np.diag([1.0, 2.0, 4.0])
+    for rows in (0, 2):
+        inverse = invert(mass, np.zeros((rows, 3)), UNITS[3], TOLERANCE)
+        assert int(inverse.rank) == 0
+        assert float(inverse.distance) == 1.0
+        a, multipliers = apply(inverse, np.ones(3), np.zeros(rows))
+        np.testing.assert_allclose(a, 1.0 / np.diagonal(mass), rtol=1e-15)
+        np.testing.assert_array_equal(multipliers, np.zeros(rows))
+
+
+def compositions(metric, given_problem, units, theta):
+    function = lambda theta: solved(metric, given_problem, units, theta)[0]
+    return {
+        "value": function(theta),
+        "forward": jax.jacfwd(function)(theta),
+        "reverse": jax.jacrev(function)(theta),
+        "forward of forward": jax.jacfwd(jax.jacfwd(function))(theta),
+        "forward of reverse": jax.jacfwd(jax.jacrev(function))(theta),
+        "reverse of forward": jax.jacrev(jax.jacfwd(function))(theta),
+        "reverse of reverse": jax.jacrev(jax.jacrev(function))(theta),
+    }
+
+
+derivatives = jax.jit(compositions, static_argnums=0)
+derivatives_of_batch = jax.jit(jax.vmap(compositions, (None, None, None, 0)), static_argnums=0)
+STEP = 1e-5
+AROUND = THETA + STEP * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+def central(values):
+    """Differences over AROUND, the direction last as JAX has it."""
+    return np.stack([values[1] - values[2], values[3] - values[4]], axis=-1) / (2 * STEP)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("case", RANKS)
+def test_derivatives_to_second_order_in_all_modes(case, metric):
+    chosen = problem(case)
+    units = UNITS[chosen.masses.size]
+    batch = jax.tree.map(np.asarray, derivatives_of_batch(metric, chosen, units, AROUND))
+    first, second = central(batch["value"]), central(batch["forward"])
+    for mode, found in batch.items():
+        expected = {"value": batch["value"][0], "forward": first, "reverse": first}.get(mode, second)
+        # Truncation of the differences is of the order STEP², their rounding of 1e-16 / STEP.
+        np.testing.assert_allclose(found[0], expected, atol=1e-8 * np.max(np.abs(expected)), err_msg=mode)
+    for mode in ("forward of reverse", "reverse of forward", "reverse of reverse"):
+        scale = np.max(np.abs(second))
+        np.testing.assert_allclose(batch[mode], batch["forward of forward"], atol=1e-12 * scale, err_msg=mode)
+    np.testing.assert_allclose(batch["reverse"], batch["forward"], atol=1e-12 * np.max(np.abs(first)))
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_a_batch_of_derivatives_equals_its_members(metric):
+    """Redundant and zero rows in one batch, each with a rank of its own."""
+    alone = [problem("redundant"), problem("zero rows"), problem("regular")]
+    batch = jax.tree.map(lambda *entries: np.stack(entries), *alone)
+    over_problems = jax.jit(jax.vmap(compositions, (None, 0, None, None)), static_argnums=0)
+    together = over_problems(metric, batch, UNITS[5], THETA)
+    for index, chosen in enumerate(alone):
+        single = derivatives(metric, chosen, UNITS[5], THETA)
+        for mode, found in together.items():
+            scale = np.max(np.abs(single[mode]))
+            np.testing.assert_allclose(found[index], single[mode], atol=1e-12 * scale, err_msg=mode)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("case", ["regular", "massless"])
+def test_sweeps_converge_at_the_rate_of_the_distance(case, metric):
+    """The inverse of a system ε away: k sweeps leave an error of the order ε^(k + 1)."""
+    chosen = problem(case)
+    sweeps, distances = range(4), (1e-2, 1e-3)
+    errors = np.array([[error_after(chosen, metric, count, away) for count in sweeps] for away in distances])
+    for order, (far, near) in enumerate(zip(*errors, strict=True), start=1):
+        if near > 1e-13:
+            assert far / near == pytest.approx(10.0**order, rel=0.3 * order)
+    assert errors[1, 3] < 1e-9
+
+
+def error_after(chosen, metric, sweeps, away):
+    direction = np.array([0.6, -0.8])
+    mass, jacobian, f, gamma = matrices(chosen, THETA)
+    nearby = matrices(chosen, THETA + away * direction)[:2]
+    inverse = inverted(metric, *nearby, UNITS[len(mass)])
+    exact = constrained_solve(inverted(metric, mass, jacobian, UNITS[len(mass)]), mass, jacobian, f, gamma, 3)[0]
+    return np.max(np.abs(constrained_solve(inverse, mass, jacobian, f, gamma, sweeps)[0] - exact))

@@ -1,0 +1,151 @@
+"""Our pivoted QR against LAPACK's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from linkax.linalg.pivoted_qr import pivoted_qr
+
+SHAPES = {"tall": (7, 4), "wide": (4, 7), "square": (6, 6), "row": (1, 5), "column": (5, 1)}
+
+factorise = jax.jit(pivoted_qr)
+
+
+def assert_factorisation(a, tolerance=1e-14):
+    """A P = Q R with Q orthogonal and R upper trapezoidal, its diagonal falling."""
+    q, r, order = map(np.asarray, factorise(a))
+    n, m = a.shape
+    scale = max(np.linalg.norm(a), np.finfo(a.dtype).tiny)
+    assert sorted(order) == list(range(m))
+    np.testing.assert_allclose(q.T @ q, np.eye(n), atol=tolerance * n)
+    np.testing.assert_allclose(q @ r / scale, a[:, order] / scale, atol=tolerance * n)
+    assert np.all(np.tril(r, -1) == 0.0)
+    diagonal = np.abs(np.diagonal(r))
+    assert np.all(diagonal[1:] <= diagonal[:-1] * (1 + 10 * tolerance) + tolerance * scale)
+    return r, order
+
+
+def assert_like_lapack(a, tolerance=1e-13):
+    """The same pivots and the same |R| (signs of its rows are a convention)."""
+    r, order = assert_factorisation(a)
+    _, expected, pivots = scipy.linalg.qr(a, pivoting=True)
+    np.testing.assert_array_equal(order, pivots)
+    np.testing.assert_allclose(np.abs(r), np.abs(expected), atol=tolerance * np.linalg.norm(a))
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_random(shape, seed):
+    assert_like_lapack(np.random.default_rng(seed).normal(size=shape))
+
+
+@pytest.mark.parametrize("shape", [SHAPES["tall"], SHAPES["wide"], SHAPES["square"]])
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_graded_columns(shape, seed):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=shape)
+    sizes = rng.permutation(np.logspace(-12, 0, shape[1]))
+    a *= sizes / np.linalg.norm(a, axis=0)
+    assert_like_lapack(a)
+    # Small columns come out right to their own size, not only to that of the largest.
+    r, order = assert_factorisation(a)
+    np.testing.assert_allclose(np.linalg.norm(r, axis=0), sizes[order], rtol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_graded_singular_values(seed):
+    rng = np.random.default_rng(seed)
+    left, right = (np.linalg.qr(rng.normal(size=(6, 6)))[0] for _ in range(2))
+    a = left @ np.diag(np.logspace(0, -12, 6)) @ right
+    assert_like_lapack(a)
+
+
+def test_kahan():
+    """Kahan's matrix is its own R, and hides that it is nearly singular from the pivoting."""
+    n, angle = 12, 1.2
+    a = np.sin(angle) ** np.arange(n)[:, None] * (np.eye(n) - np.cos(angle) * np.triu(np.ones((n, n)), 1))
+    # Its columns tie at each step; Kahan's perturbation of the diagonal decides for the first.
+    a += 25 * np.finfo(float).eps * np.diag(np.arange(n, 0, -1.0))
+    assert_like_lapack(a)
+    r, order = assert_factorisation(a)
+    np.testing.assert_array_equal(order, np.arange(n))
+    np.testing.assert_allclose(np.abs(r), np.abs(a), atol=1e-14)
+    assert np.linalg.svd(a, compute_uv=False)[-1] < 0.2 * np.abs(r[-1, -1])
+
+
+@pytest.mark.parametrize("rows", [3, 8])
+def test_duplicate_columns(rows):
+    """Equal columns tie exactly, so which of them comes first is free: |R| is the same for all."""
+    a = np.random.default_rng(rows).normal(size=(rows, 3))[:, [0, 1, 0, 2, 1, 0]]
+    r, _ = assert_factorisation(a)
+    _, expected, _ = scipy.linalg.qr(a, pivoting=True)
+    np.testing.assert_allclose(np.abs(r[:, :3]), np.abs(expected[:, :3]), atol=1e-14)
+    np.testing.assert_allclose(r[3:], 0.0, atol=1e-14)
+
+
+def test_equal_axis_aligned_columns():
+    """All columns tie exactly; any order is right, and gives the same |R|."""
+    a = np.eye(5)[:, [3, 0, 4, 1]] * np.array([2.0, -2.0, 2.0, -2.0])
+    r, _ = assert_factorisation(a, tolerance=0.0)
+    np.testing.assert_array_equal(np.abs(r), 2.0 * np.eye(5, 4))
+
+
+def test_axis_aligned_columns_of_different_size():
+    """The head of a column is exactly zero where its sign chooses the reflection."""
+    a = np.eye(5)[:, [3, 0, 4, 1]] * np.array([1.0, -3.0, 2.0, -4.0])
+    assert_like_lapack(a)
+
+
+@pytest.mark.parametrize("shape", [SHAPES["tall"], SHAPES["wide"]])
+def test_zero_matrix(shape):
+    q, r, _ = factorise(np.zeros(shape))
+    np.testing.assert_array_equal(q, np.eye(shape[0]))
+    np.testing.assert_array_equal(r, np.zeros(shape))
+
+
+def test_zero_rows_and_columns():
+    a = np.random.default_rng(1).normal(size=(6, 6))
+    a[:, 2] = a[4] = 0.0
+    r, order = assert_factorisation(a)
+    _, expected, _ = scipy.linalg.qr(a, pivoting=True)
+    assert order[-1] == 2
+    np.testing.assert_allclose(np.abs(r[:, :5]), np.abs(expected[:, :5]), atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", [SHAPES["tall"], SHAPES["wide"]])
+def test_a_batch_equals_its_members(shape):
+    batch = np.random.default_rng(2).normal(size=(8, *shape))
+    together = jax.jit(jax.vmap(pivoted_qr))(batch)
+    for index, a in enumerate(batch):
+        q, r, order = factorise(a)
+        np.testing.assert_array_equal(together.order[index], order)
+        np.testing.assert_allclose(together.q[index], q, atol=1e-14)
+        np.testing.assert_allclose(together.r[index], r, atol=1e-14)
+
+
+def test_compiled_equals_uncompiled():
+    a = np.random.default_rng(3).normal(size=SHAPES["tall"])
+    for compiled, plain in zip(factorise(a), pivoted_qr(jnp.asarray(a)), strict=True):
+        np.testing.assert_allclose(compiled, plain, atol=1e-14)
+
+
+def test_single_precision():
+    a = np.random.default_rng(4).normal(size=SHAPES["square"]).astype(np.float32)
+    q, r, order = factorise(a)
+    assert q.dtype == r.dtype == jnp.float32
+    assert_factorisation(a, tolerance=10 * np.finfo(np.float32).eps)
+    _, expected, pivots = scipy.linalg.qr(a.astype(np.float64), pivoting=True)
+    np.testing.assert_array_equal(order, pivots)
+    np.testing.assert_allclose(np.abs(r), np.abs(expected), atol=20 * np.finfo(np.float32).eps)
+
+
+def test_one_loop_whatever_the_size():
+    texts = [factorise.lower(jnp.zeros(shape)).as_text() for shape in [(5, 3), (50, 30), (30, 50)]]
+    assert [text.count("stablehlo.while") for text in texts] == [1, 1, 1]
+    assert len({text.count("\n") for text in texts}) == 1

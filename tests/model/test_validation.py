@@ -1,0 +1,159 @@
+"""Every message on bad input names the element, the value and the remedy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+
+
+def body(name="part", mass=1.0, inertia=(1.0, 1.0, 1.0), **options):
+    return lx.RigidBody(name, mass, inertia=inertia, **options)
+
+
+BAD = {
+    "negative mass": (lambda: body(mass=-2.0), ["'part'", "-2.0", "zero or more"]),
+    "mass not a number": (lambda: body(mass=float("nan")), ["'part'", "nan", "finite"]),
+    "infinite mass": (lambda: body(mass=np.inf), ["'part'", "inf", "finite"]),
+    "mass as text": (lambda: body(mass="heavy"), ["'part'", "'heavy'", "must be a number"]),
+    "mass of two": (lambda: body(mass=[1.0, 2.0]), ["'part'", "(2,)", "single number"]),
+    "triangle inequality": (lambda: body(inertia=(1.0, 1.0, 3.0)), ["'part'", "3.0", "triangle inequality"]),
+    "negative inertia": (lambda: body(inertia=(1.0, 1.0, -0.1)), ["'part'", "-0.1", "must not be negative"]),
+    "asymmetric inertia": (
+        lambda: body(inertia=np.eye(3) + np.triu(np.ones((3, 3)), 1) / 10),
+        ["'part'", "0.1", "symmetric"],
+    ),
+    "inertia of wrong shape": (lambda: body(inertia=np.eye(2)), ["'part'", "(2, 2)", "(3, 3)"]),
+    "center of mass of wrong shape": (lambda: body(center_of_mass=[0.0, 1.0]), ["'part'", "(2,)", "(3,)"]),
+    "named ground": (lambda: body("ground"), ["'ground'", "lx.GROUND", "choose another"]),
+    "no name": (lambda: body(""), ["''", "non-empty"]),
+    "rod of no length": (lambda: lx.rod("bar", 0.0, 1.0), ["'bar'", "0.0", "positive"]),
+    "rod of negative mass": (lambda: lx.rod("bar", 1.0, -1.0), ["'bar'", "-1.0", "zero or more"]),
+    "flat box": (lambda: lx.box("crate", [1.0, 0.0, 1.0], 1.0), ["'crate'", "0.0", "positive"]),
+    "unknown frame": (lambda: lx.rod("bar", 1.0, 1.0).at("end"), ["'bar'", "'end'", "'base', 'tip'"]),
+    "offset of wrong shape": (lambda: body().at([1.0, 2.0]), ["'part'", "(2,)", "(3,)"]),
+    "rotation not orthonormal": (lambda: body().at([0, 0, 0], 2 * np.eye(3)), ["'part'", "2.0", "orthonormal"]),
+    "left-handed rotation": (lambda: body().at([0, 0, 0], np.diag([1, 1, -1])), ["'part'", "-1.0", "right-handed"]),
+    "zero axis": (lambda: lx.Revolute("pin", lx.GROUND, body(), [0, 0, 0]), ["'pin'", "0.0", "nonzero vector"]),
+    "zero axis as a JAX array": (
+        lambda: lx.Revolute("pin", lx.GROUND, body(), jnp.zeros(3)),
+        ["'pin'", "0.0", "nonzero vector"],
+    ),
+    "unknown axis": (lambda: lx.Revolute("pin", lx.GROUND, body(), "w"), ["'pin'", "'w'", "x, -x, y"]),
+    "axis of wrong shape": (lambda: lx.Prismatic("pin", lx.GROUND, body(), [1, 0]), ["'pin'", "(2,)", "(3,)"]),
+    "joint with itself": (
+        lambda: lx.Revolute("pin", body().at([0, 0, 0]), body().at([1, 0, 0]), "z"),
+        ["'pin'", "'part'", "two bodies"],
+    ),
+    "joint with a name": (lambda: lx.Revolute("pin", "part", body(), "z"), ["'pin'", "'part'", "body.at"]),
+    "joint without a name": (lambda: lx.Revolute("", lx.GROUND, body(), "z"), ["''", "non-empty"]),
+    "gravity of wrong shape": (lambda: lx.Gravity(9.81), ["Gravity", "()", "(3,)"]),
+    "torque that is not finite": (lambda: lx.JointTorque("pin", np.inf), ["'pin'", "inf", "finite"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_element(case):
+    build, words = BAD[case]
+    with pytest.raises(ValueError, match=r".") as error:
+        build()
+    for word in words:
+        assert word in str(error.value)
+
+
+LINK, OTHER = lx.rod("link", 1.0, 1.0), lx.rod("other", 1.0, 1.0)
+PIN = lx.Revolute("pin", lx.GROUND, LINK.at("base"), "z")
+KNEE = lx.Revolute("knee", LINK.at("tip"), OTHER.at("base"), "z")
+CUT_KNEE = lx.Revolute("knee", LINK.at("tip"), OTHER.at("base"), "z", cut=True)
+WELD = lx.Fixed("weld", lx.GROUND, OTHER)
+SPREAD = {
+    "two bodies of one name": ([LINK, LINK], [PIN], [], ["'link'", "2 times", "of its own"]),
+    "two joints of one name": ([LINK], [PIN, PIN], [], ["'pin'", "2 times", "of its own"]),
+    "joint to a body that is not there": ([LINK], [PIN, KNEE], [], ["'knee'", "'other'", "add it"]),
+    "body that hangs on nothing": ([LINK, OTHER], [PIN], [], ["'other'", "ground", "join"]),
+    "cut joint that closes no loop": ([LINK, OTHER], [PIN, CUT_KNEE], [], ["'knee'", "cut=True", "remove"]),
+    "no body": ([LINK, "other"], [PIN], [], ["bodies", "'other'", "RigidBody"]),
+    "torque on an unknown joint": ([LINK], [PIN], [lx.JointTorque("nip", 1.0)], ["'nip'", "JointTorque", "'pin'"]),
+    "torque on a weld": ([OTHER], [WELD], [lx.JointTorque("weld", 1.0)], ["'weld'", "0 coordinates", "not one"]),
+    "torque on a cut joint": (
+        [LINK, OTHER],
+        [PIN, CUT_KNEE, WELD],
+        [lx.JointTorque("knee", 1.0)],
+        ["'knee'", "is cut", "remove cut=True"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SPREAD)
+def test_bad_mechanism(case):
+    bodies, joints, forces, words = SPREAD[case]
+    with pytest.raises(ValueError, match=r".") as error:
+        lx.Mechanism(bodies, joints, forces)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_axes_are_normalised_and_static_unless_traced():
+    structure = lambda axis: jax.tree.structure(lx.Revolute("pin", lx.GROUND, LINK, axis))
+    assert structure("z") == structure((0, 0, 2)) == structure([0.0, 0.0, 1.0]) == structure(np.array([0, 0, 5.0]))
+    assert structure("z") != structure("x")
+    traced = [lx.Revolute("pin", lx.GROUND, LINK, jnp.array(axis)) for axis in ([0.0, 0.0, 2.0], [1.0, 0.0, 0.0])]
+    assert jax.tree.structure(traced[0]) == jax.tree.structure(traced[1]) != structure("z")
+    np.testing.assert_allclose(traced[0].axis, [0.0, 0.0, 1.0])
+
+
+def mechanism(length, mass=1.0):
+    link, other = lx.rod("link", length, mass), lx.rod("other", 1.0, 1.0)
+    return lx.Mechanism(
+        [link, other],
+        [
+            lx.Revolute("pin", lx.GROUND, link.at("base"), "z"),
+            lx.Revolute("knee", link.at("tip"), other.at("base"), "z"),
+        ],
+        [lx.Gravity([0.0, -9.81, 0.0])],
+    )
+
+
+def test_other_numbers_are_the_same_structure():
+    assert jax.tree.structure(mechanism(1.0)) == jax.tree.structure(mechanism(2, mass=3))
+    assert all(hasattr(leaf, "dtype") for leaf in jax.tree.leaves(mechanism(1.0)))
+
+
+def test_mechanisms_are_built_under_transformations():
+    tip = lambda length: mechanism(length).body("link").frames["tip"][0]
+    np.testing.assert_allclose(jax.grad(lambda length: tip(length) ** 2)(3.0), 6.0)
+    np.testing.assert_allclose(jax.vmap(tip)(jnp.array([1.0, 2.0])), [1.0, 2.0])
+    np.testing.assert_allclose(jax.jit(tip)(1.5), 1.5)
+
+
+def test_the_tree_grows_breadth_first_and_is_described():
+    bars = [lx.rod(f"bar_{i}", 1.0, 1.0) for i in range(3)]
+    joints = [
+        lx.Revolute("left", lx.GROUND, bars[0].at("base"), "z"),
+        lx.Revolute("first", bars[0].at("tip"), bars[1].at("base"), "z"),
+        lx.Revolute("second", bars[1].at("tip"), bars[2].at("tip"), "z"),
+        lx.Revolute("right", lx.GROUND.at([1, 0, 0]), bars[2].at("base"), "z"),
+    ]
+    for order in (joints, joints[::-1]):
+        topology = lx.Mechanism(bars, order).topology
+        assert {"left", "right"} <= set(topology.coordinates)
+        assert topology.num_cuts == 1
+    driven = lx.Mechanism(bars, joints, [lx.JointTorque("second", 1.0)]).topology
+    assert "second" in driven.coordinates
+    assert "cut  Revolute" in driven.describe()
+    assert "tree Revolute 'second'" in driven.describe()
+
+
+def test_a_traced_axis_drops_no_row():
+    def loop(axis):
+        arm, rod = lx.rod("arm", 1.0, 1.0), lx.rod("rod", 1.0, 1.0)
+        joints = [
+            lx.Revolute("a", lx.GROUND, arm.at("base"), axis),
+            lx.Revolute("b", lx.GROUND.at([1, 0, 0]), rod.at("base"), axis),
+            lx.Revolute("c", arm.at("tip"), rod.at("tip"), axis, cut=True),
+        ]
+        return lx.Mechanism([arm, rod], joints).topology.num_rows
+
+    assert loop("z") == loop((0.0, 1.0, 1.0)) == 2
+    assert loop(jnp.array([0.0, 0.0, 1.0])) == 5

@@ -1,0 +1,88 @@
+"""The command line, as a user meets it."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from linkax.cli import main
+
+KEYS = {
+    "scene", "variant", "t1", "preset", "steps", "compile_s", "run_s", "position_violation", "velocity_violation",
+    "acceleration_violation", "energy_error", "rank_min", "rank_max", "result", "final",
+}  # fmt: skip
+
+BAD = {
+    "simulate nothing": "unknown scene 'nothing'; known: pendulum, crank-slider, n-four-bar",
+    "simulate pendulum --variant A99": "no variant 'A99'; known: A01",
+    "simulate pendulum --set size=2": "no parameter 'size'; known: length",
+    "simulate pendulum --set length=long": "'length' of scene 'pendulum' is 'long'; it must be a finite number",
+    "simulate pendulum --set length=nan": "finite number",
+    "simulate pendulum --set mass=-1": "mass [kg] is -1.0; it must be zero or more",
+    "simulate pendulum --set length": "write --set NAME=VALUE",
+    "simulate n-four-bar --set N=2.5": "'N' of scene 'n-four-bar' is '2.5'; it must be an integer",
+    "simulate n-four-bar --set N=0": "integer of at least 1",
+    "simulate pendulum --preset best": "unknown 'best'; known: draft, balanced, precise",
+    "simulate pendulum --solver euler": "unknown 'euler'; known: tsit5, dopri5, dopri8",
+    "simulate pendulum --rtol 0": "'0' is not a positive, finite number",
+    "simulate pendulum --rtol nan": "not a positive",
+    "simulate pendulum --t1 -3": "positive, finite",
+    "simulate crank-slider --set rod=0.5 --set angle=1.5": "joint 'wrist_pin' does not close: a gap of",
+    "fly": "invalid choice",
+    "": "COMMAND",
+}
+
+
+@pytest.mark.parametrize("command", BAD)
+def test_bad_input_is_one_line_and_code_two(command, capsys, tmp_path):
+    out = ["--out", str(tmp_path), "--no-plots"] if command.startswith("simulate") else []
+    assert main([*command.split(), *out]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    *progress, line = printed.err.strip().splitlines()
+    assert BAD[command] in line
+    assert progress in ([], ["assembling ..."])
+
+
+def test_list_names_everything(capsys):
+    assert main(["list"]) == 0
+    printed = capsys.readouterr().out
+    for word in ("pendulum", "crank-slider", "n-four-bar", "SC4", "A02", "FL2", "N = 2", "slider_mass"):
+        assert word in printed
+
+
+def test_json_is_one_object_and_files_are_whole(capsys, tmp_path):
+    command = ["simulate", "pendulum", "--t1", "2", "--preset", "draft", "--out", str(tmp_path), "--json"]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    found = json.loads(printed)
+    assert printed.count("\n") == 1
+    assert set(found) >= KEYS
+    assert found["result"] == "successful"
+    assert len(found["final"]["bob"]) == 3
+    assert found == json.loads((tmp_path / "summary.json").read_text())
+    kept = np.load(tmp_path / "trajectory.npz")
+    assert {"t", "q", "v", "coordinates", "energy", "rank", "position_bob", "force_pivot", "moment_pivot"} <= set(kept)
+    assert kept["position_bob"].shape == (len(kept["t"]), 3)
+    np.testing.assert_allclose(kept["position_bob"][-1], found["final"]["bob"])
+    pictures = {path.name for path in tmp_path.glob("*.png")}
+    assert pictures == {"motion_bob.png", "violations.png", "energy.png", "reaction_pivot.png"}
+    with Image.open(tmp_path / "mechanism.gif") as film:
+        frames = []
+        for index in range(film.n_frames):
+            film.seek(index)
+            frames.append(np.asarray(film.convert("RGB")))
+    assert len(frames) > 20
+    assert np.std(frames[0]) > 1.0
+    assert np.any(frames[0] != frames[len(frames) // 2])
+    assert not [path for path in tmp_path.iterdir() if "unfinished" in path.name]
+
+
+def test_summary_for_people(capsys, tmp_path):
+    command = ["simulate", "pendulum", "--t1", "2", "--preset", "draft", "--out", str(tmp_path), "--no-plots"]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    for word in ("successful", "steps", "compile time", "run time", "position violation", "energy error", "bob"):
+        assert word in printed
+    assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "trajectory.npz"}
