@@ -65,3 +65,18 @@ def test_lengths_that_differ():
     differences = central_differences(jax.jit(lambda numbers: separate_lengths(**numbers)), numbers)
     for name in numbers:
         np.testing.assert_allclose(found[name], differences[name], rtol=1e-6)
+
+
+def test_masses_alone_from_a_state_that_is_given():
+    """Only the forces depend on the numbers: right-hand sides of corrections have no derivative."""
+
+    def final_angle(mass):
+        settings = SCENE.settings("regular", {"rod_mass": mass})
+        mechanism = SCENE.mechanism(settings)
+        start = lx.State(jnp.array([0.0, 0.4, 0.0]), jnp.zeros(3))
+        found = lx.simulate(mechanism, start, t1=0.3, accuracy=lx.Accuracy(rtol=1e-10), saveat=SAVE_END)
+        return found.end.q[0]
+
+    found, step = jax.jit(jax.grad(final_angle))(0.2), 1e-4
+    difference = (jax.jit(final_angle)(0.2 + step) - jax.jit(final_angle)(0.2 - step)) / (2 * step)
+    np.testing.assert_allclose(found, difference, rtol=1e-6)

@@ -93,7 +93,7 @@ class TangentSpace(eqx.Module):
         """The smallest correction of q that closes the linearised loops."""
         weight = self._weight(system, instant)
         still = jnp.zeros(weight.shape[0], weight.dtype)
-        return constrained_solve(split, weight, instant.jacobian, still, -residual(instant.cuts))[0]
+        return constrained_solve(split, weight, instant.jacobian, still, -residual(instant.cuts), sweeps=0)[0]
 
     def _corrected(self, system, q, v):
         """One factorisation, at q; then a fixed number of corrections with it."""

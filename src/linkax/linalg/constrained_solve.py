@@ -124,23 +124,26 @@ def constrained_solve(inverse: Inverse, mass, jacobian, f, gamma, sweeps: int = 
     **Returns:** a, (n,), and λ, (m,), zero on dependent rows.
     """
 
-    def residual_form(unknowns):
-        a, multipliers = unknowns
-        return mass @ a - jacobian.T @ multipliers, jacobian @ a
+    n = mass.shape[0]
+
+    def forwards(unknowns):
+        a, multipliers = unknowns[:n], unknowns[n:]
+        return jnp.concatenate([mass @ a - jacobian.T @ multipliers, jacobian @ a])
+
+    def nearby(right):
+        return jnp.concatenate(apply(inverse, right[:n], right[n:]))
 
     def solve(_, right):
-        f, gamma = right
-        a, multipliers = apply(inverse, f, gamma)
+        unknowns = nearby(right)
         for _ in range(sweeps):
-            force, rate = residual_form((a, multipliers))
-            correction, change = apply(inverse, f - force, gamma - rate)
-            a, multipliers = a + correction, multipliers + change
-        return a, multipliers
+            unknowns = unknowns + nearby(right - forwards(unknowns))
+        return unknowns
 
     def transpose_solve(_, right):
         # The transpose of [[M, -Jᵀ], [J, 0]] differs by the signs of its second row and column.
-        force, rate = right
-        a, multipliers = solve(None, (force, -rate))
-        return a, -multipliers
+        flip = jnp.concatenate([jnp.ones(n, right.dtype), -jnp.ones(len(right) - n, right.dtype)])
+        return flip * solve(None, flip * right)
 
-    return lax.custom_linear_solve(residual_form, (f, gamma), solve, transpose_solve)
+    # One vector, not a pair: JAX transposes such a solve only where all of its right side is linear.
+    unknowns = lax.custom_linear_solve(forwards, jnp.concatenate([f, gamma]), solve, transpose_solve)
+    return unknowns[:n], unknowns[n:]

@@ -47,10 +47,10 @@ def animate_mechanism(solution: Solution, path, points=None, dpi: int = 100) -> 
     figure, axes = _canvas(scenery, dpi)
     _draw_ground(axes, scenery)
     actors = [
-        *_draw_traces(axes, scenery),
         *_draw_slides(axes, scenery),
         *_draw_bodies(axes, scenery),
         *_draw_hinges(axes, scenery),
+        *_draw_traces(axes, scenery),
         _draw_clock(axes, np.asarray(moments.ts)),
     ]
     frames = _filmed(figure, axes, actors, len(moments.ts))
