@@ -2,8 +2,6 @@
 
 from typing import NamedTuple
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
