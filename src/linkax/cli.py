@@ -32,6 +32,9 @@ def main(argv=None) -> int:
     try:
         arguments = _parser().parse_args(argv)
         return arguments.command(arguments)
+    except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
+        sys.stderr.close()
+        return 0
     except (ValueError, OSError) as error:
         print(f"linkax: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
