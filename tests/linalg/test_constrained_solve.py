@@ -111,7 +111,6 @@ def test_it_solves_the_saddle_point_system(case, metric, seed):
     np.testing.assert_allclose(unique[n:], jacobian.T @ expected[n:], atol=atol)
     np.testing.assert_allclose(mass @ unique[:n], f + jacobian.T @ multipliers, atol=atol)
     np.testing.assert_allclose(jacobian @ unique[:n], gamma, atol=atol)
-    assert np.sum(multipliers != 0.0) <= RANKS[case]
 
 
 @pytest.mark.parametrize("case", RANKS)

@@ -121,7 +121,7 @@ def constrained_solve(inverse: Inverse, mass, jacobian, f, gamma, sweeps: int = 
     system with the right-hand sides df − dM a + dJᵀλ and dγ − dJ a; nothing is differentiated
     through the pivoting. They hold where the rank of J does not change.
 
-    **Returns:** a, (n,), and λ, (m,), zero on dependent rows.
+    **Returns:** a, (n,), and λ, (m,); with dependent rows a and Jᵀλ are unique, λ is one of many.
     """
 
     n = mass.shape[0]
