@@ -12,30 +12,26 @@ SCENE = SCENES["crank-slider"]
 SAVE_END = diffrax.SaveAt(t1=True)
 
 
-def final_position(changes, adjoint=None):
-    """Where the slider is after 1 s of SC4; `length` scales crank and rod alike."""
-    changes = dict(changes)
-    length = changes.pop("length")
-    settings = SCENE.settings("SC4", changes | {"crank": length, "rod": length})
+def final_position(numbers, t1, adjoint=None):
+    """Where the slider of the crank-slider is at t1, of all the scene's numbers."""
+    settings = SCENE.settings("SC4", numbers)
     mechanism = SCENE.mechanism(settings)
-    state = SCENE.initial(mechanism, settings)
-    accuracy = lx.Accuracy(rtol=1e-12)
-    return lx.simulate(mechanism, state, t1=1.0, accuracy=accuracy, saveat=SAVE_END, adjoint=adjoint).position(
-        "slider"
-    )[0, 0]
+    state, accuracy = SCENE.initial(mechanism, settings), lx.Accuracy(rtol=1e-12)
+    found = lx.simulate(mechanism, state, t1=t1, accuracy=accuracy, saveat=SAVE_END, adjoint=adjoint)
+    return found.position("slider")[0, 0]
 
 
-def separate_lengths(crank, rod):
-    """The same with unlike lengths, which meet no singular configuration."""
-    settings = SCENE.settings("SC4", {"crank": crank, "rod": rod})
-    mechanism = SCENE.mechanism(settings)
-    state = SCENE.initial(mechanism, settings)
-    return lx.simulate(mechanism, state, t1=1.0, accuracy=lx.Accuracy(rtol=1e-12), saveat=SAVE_END).position("slider")[
-        0, 0
-    ]
+# Compiled once, for all tests here.
+POSITION = jax.jit(final_position)
+REVERSE = jax.jit(jax.grad(final_position))
 
 
-NUMBERS = {"length": 1.0, "crank_mass": 1.0, "rod_mass": 1.0, "slider_mass": 1.0, "gravity": 9.81}
+def numbers(**changes):
+    given = {"crank": 1.0, "rod": 1.0, "angle": np.pi / 3, "gravity": 9.81} | dict.fromkeys(MASSES, 1.0) | changes
+    return {name: jnp.asarray(number) for name, number in given.items()}
+
+
+MASSES = ("crank_mass", "rod_mass", "slider_mass")
 
 
 def central_differences(function, numbers, step=1e-4):
@@ -49,22 +45,54 @@ def central_differences(function, numbers, step=1e-4):
 
 
 def test_reverse_and_forward_mode_agree_with_central_differences():
-    numbers = {name: jnp.asarray(number) for name, number in NUMBERS.items()}
-    reverse = jax.jit(jax.grad(final_position))(numbers)
-    forward = jax.jit(jax.jacfwd(lambda numbers: final_position(numbers, diffrax.ForwardMode())))(numbers)
-    differences = central_differences(jax.jit(final_position), numbers)
-    for name in NUMBERS:
+    at = numbers()
+    reverse = REVERSE(at, 1.0)
+    forward = jax.jit(jax.jacfwd(lambda numbers: final_position(numbers, 1.0, diffrax.ForwardMode())))(at)
+    differences = central_differences(lambda numbers: POSITION(numbers, 1.0), at)
+    for name in at:
         np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(reverse[name], differences[name], rtol=1e-6, atol=1e-9)
 
 
 def test_lengths_that_differ():
-    reverse = jax.jit(jax.grad(lambda numbers: separate_lengths(**numbers)))
-    numbers = {"crank": jnp.asarray(0.8), "rod": jnp.asarray(1.1)}
-    found = reverse(numbers)
-    differences = central_differences(jax.jit(lambda numbers: separate_lengths(**numbers)), numbers)
-    for name in numbers:
-        np.testing.assert_allclose(found[name], differences[name], rtol=1e-6)
+    at = numbers(crank=0.8, rod=1.1)
+    found, differences = REVERSE(at, 1.0), central_differences(lambda numbers: POSITION(numbers, 1.0), at)
+    for name in at:
+        np.testing.assert_allclose(found[name], differences[name], rtol=1e-6, atol=1e-9)
+
+
+def test_masses_through_three_passages():
+    """SC1 against the motion of the crank alone, by Lagrange's equation, differentiated as it is solved."""
+    t1, gravity = 5.0, 9.81
+
+    def reduced(masses):
+        crank, rod, slider = masses
+        inertia = lambda a: crank / 3 + rod * (1 / 3 + 2 * jnp.sin(a) ** 2) + 4 * slider * jnp.sin(a) ** 2
+        height = lambda a: 0.5 * (crank + rod) * jnp.sin(a)
+
+        def rates(t, y, args):
+            a, w = y
+            force = -0.5 * jax.grad(inertia)(a) * w**2 - gravity * jax.grad(height)(a)
+            return w, force / inertia(a)
+
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(rates),
+            diffrax.Dopri8(scan_kind="lax"),
+            0.0,
+            t1,
+            1e-3,
+            (jnp.zeros(()), jnp.zeros(())),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=6000,
+        )
+        return 2.0 * jnp.cos(found.ys[0][0])
+
+    masses = {"crank_mass": 1.0, "rod_mass": 1.2, "slider_mass": 0.8}
+    at, values = numbers(angle=0.0, **masses), jnp.array(list(masses.values()))
+    np.testing.assert_allclose(POSITION(at, t1), reduced(values), atol=1e-9)
+    found, exact = REVERSE(at, t1), jax.jacfwd(reduced)(values)
+    for name, derivative in zip(masses, exact, strict=True):
+        np.testing.assert_allclose(found[name], derivative, rtol=1e-6)
 
 
 def test_masses_alone_from_a_state_that_is_given():

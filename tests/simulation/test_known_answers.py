@@ -20,7 +20,7 @@ def run(name, variant=None, changes=None, *, t1, accuracy=lx.PRECISE):
     return lx.simulate(mechanism, scene.initial(mechanism, settings), t1=t1, accuracy=accuracy)
 
 
-@pytest.mark.parametrize(("variant", "bound"), [("SC1", 1e-8), ("SC2", 1e-8), ("SC3", 5e-8), ("SC4", 1e-8)])
+@pytest.mark.parametrize(("variant", "bound"), [("SC1", 1e-9), ("SC2", 1e-9), ("SC3", 5e-9), ("SC4", 1e-9)])
 def test_slider_position_through_singular_passages(variant, bound):
     known, found = reference(f"crank_slider_{variant}"), run("crank-slider", variant, t1=5.0)
     np.testing.assert_allclose(found.ts, known["t"], atol=1e-12)
@@ -53,11 +53,11 @@ def test_pendulum_at_ten_seconds():
     assert np.hypot(bob[0] - known["x"][20], bob[1] - known["y"][20]) <= 1e-9
 
 
-@pytest.mark.parametrize("count", [1, 2, 10])
+@pytest.mark.parametrize("count", [1, 2, 5, 10])
 def test_row_of_four_bars_stays_on_its_branch(count):
     found = run("n-four-bar", changes={"N": count}, t1=10.0)
     error = found.position("link_0", at="tip")[-1, :2] - n_four_bar(10.0, count)
-    assert np.linalg.norm(error) <= 1e-7
+    assert np.linalg.norm(error) <= 1e-8
     angles = np.stack([found.joint(f"pivot_{i}") for i in range(count + 1)])
     assert np.max(np.abs(angles - angles[0])) <= 1e-9
     # The rank drops to count where the links lie in line, at no saved time here.

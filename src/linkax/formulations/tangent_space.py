@@ -16,6 +16,8 @@ from linkax.equations.dynamics import generalised_force, mass_matrix
 from linkax.equations.kinematics import configure, move
 from linkax.equations.loops import bias, cut_frames, jacobian, residual
 from linkax.equations.system import System
+from linkax.formulations.branches import Crossing
+from linkax.formulations.passage import Value, limit
 from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert, with_mass
 
 ROUNDING_ULPS = 8.0
@@ -52,16 +54,23 @@ def _at(system, q) -> _Instant:
     return _Instant(configuration, cuts, jacobian(cuts), mass_matrix(configuration))
 
 
+def _largest(rows):
+    return jnp.max(jnp.abs(rows), initial=0.0)
+
+
 class TangentSpace(eqx.Module):
     """Corrections, accelerations and multipliers by the split of the space of speeds.
 
     - `rank_tolerance`: τ; a loop row is independent where |R_kk| > τ max(|R₁₁|, 1).
+    - `rank_nearby`: rank along the motion, where it is known; in a singular configuration the
+      rank itself is smaller.
     - `metric`: in which corrections are smallest and normal and tangent space orthogonal:
       "mass" (W = M + JᵀDJ) or "identity" (radians, and lengths of the mechanism).
     - `corrections`: position corrections in each evaluation and after each step.
     """
 
     rank_tolerance: Float[Array, ""]
+    rank_nearby: Int[Array, ""] | None = None
     metric: Literal["mass", "identity"] = eqx.field(static=True, default="mass")
     corrections: int = eqx.field(static=True, default=1)
 
@@ -71,17 +80,16 @@ class TangentSpace(eqx.Module):
 
     def _split(self, system: System, instant: _Instant) -> Inverse:
         weight = instant.mass if self.metric == "mass" else None
-        return invert(weight, instant.jacobian, system.coordinate_units, self.rank_tolerance)
+        return invert(weight, instant.jacobian, system.coordinate_units, self.rank_tolerance, self.rank_nearby)
 
-    def _dynamics(self, system, t, instant, v, split, sweeps) -> Dynamics:
-        motion = move(instant.configuration, v)
+    def _solve(self, split, instant, f, gamma, sweeps):
+        """v̇ and λ of M v̇ = f + Jᵀλ, J v̇ = γ."""
         inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
-        gamma = bias(instant.cuts, motion)
-        acceleration, multipliers = constrained_solve(
-            inverse, instant.mass, instant.jacobian, generalised_force(t, motion), gamma, sweeps
-        )
-        violation = instant.jacobian @ acceleration - gamma
-        return Dynamics(acceleration, multipliers, split.rank, split.distance, violation)
+        return constrained_solve(inverse, instant.mass, instant.jacobian, f, gamma, sweeps)
+
+    def _acceleration(self, system, t, instant, v, split, sweeps):
+        motion = move(instant.configuration, v)
+        return self._solve(split, instant, generalised_force(t, motion), bias(instant.cuts, motion), sweeps)[0]
 
     def _on_velocity_level(self, system, instant, v, split, sweeps):
         """The speeds nearest to v that satisfy J v = 0."""
@@ -106,29 +114,64 @@ class TangentSpace(eqx.Module):
         v = self._on_velocity_level(system, instant, v, split, sweeps=2)
         return q, v, instant, split
 
+    def _limit(self, function, powers, details, system, q, v):
+        """A function of (method, system, v, details) and q at q, or as a limit along v."""
+        return limit(function, powers, (self, system, v, details), q, v, system.coordinate_units)
+
     @eqx.filter_jit  # traced once, however often a solver asks
-    def correct(self, system: System, q, v):
-        """q and v moved onto the manifold, for states close to it, and the distance d there."""
+    def correct(self, system: System, q, v, errors=()):
+        """q and v moved onto the manifold, for states close to it, and the distance d there.
+
+        `errors`, arrays (n_v,), are estimates of errors of the state. Of them only the part in the
+        tangent space remains in the state, and only that is returned.
+        """
         if system.topology.num_rows == 0:
-            return q, v, jnp.ones((), q.dtype)
-        q, v, _, split = self._corrected(system, q, v)
-        return q, v, split.distance
+            return q, v, errors, jnp.ones((), q.dtype)
+        q, v, instant, split = self._corrected(system, q, v)
+        if errors:
+            remaining = split.tangent @ (self._weight(system, instant) @ jnp.stack(errors, axis=1))
+            # The factors are those of the state before its correction.
+            remaining = remaining - split.normal @ (instant.jacobian @ remaining)
+            errors = tuple(remaining.T)
+        return q, v, errors, split.distance
 
     @eqx.filter_jit  # traced once, however often a solver asks
     def derivative(self, system: System, t, q, v, correct: bool):
-        """q̇ and v̇ at (q, v), corrected before the equations of motion are formed."""
+        """q̇ and v̇ at (q, v), corrected before the equations of motion are formed, and d there."""
         if correct and system.topology.num_rows > 0:
             q, v, instant, split = self._corrected(system, q, v)
-            return v, self._dynamics(system, t, instant, v, split, sweeps=2).acceleration
+            return v, self._acceleration(system, t, instant, v, split, sweeps=2), split.distance
         instant = _at(system, q)
         split = self._split(system, instant)
-        return v, self._dynamics(system, t, instant, v, split, sweeps=1).acceleration
+        return v, self._acceleration(system, t, instant, v, split, sweeps=1), split.distance
+
+    def crossing(self, system: System, q) -> Crossing:
+        """The configuration as a crossing of branches."""
+        instant = _at(system, q)
+        return Crossing(instant.configuration, instant.cuts, instant.jacobian, self._split(system, instant))
+
+    def departure(self, system: System, t, q):
+        """The configuration as a crossing of branches, and v̇ at rest there."""
+        instant = _at(system, q)
+        split, rest = self._split(system, instant), jnp.zeros(system.topology.num_coordinates, system.dtype)
+        inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
+        acceleration = inverse.tangent @ generalised_force(t, move(instant.configuration, rest))
+        return Crossing(instant.configuration, instant.cuts, instant.jacobian, split), acceleration
 
     @eqx.filter_jit
     def dynamics(self, system: System, t, q, v) -> Dynamics:
         """Accelerations and multipliers at a state on the manifold."""
         instant = _at(system, q)
-        return self._dynamics(system, t, instant, v, self._split(system, instant), sweeps=1)
+        split = self._split(system, instant)
+        motion = move(instant.configuration, v)
+        force, gamma = generalised_force(t, motion), bias(instant.cuts, motion)
+        if system.topology.num_rows == 0:
+            acceleration, multipliers = self._solve(split, instant, force, gamma, sweeps=1)
+        else:
+            (_, acceleration), _ = self._limit(_acceleration_at, (0, 2), t, system, q, v)
+            _, multipliers = self._solve(split, instant, force, instant.jacobian @ acceleration, sweeps=1)
+        violation = instant.jacobian @ acceleration - gamma
+        return Dynamics(acceleration, multipliers, split.rank, split.distance, violation)
 
     @eqx.filter_jit
     def close(self, system: System, q, v):
@@ -142,22 +185,22 @@ class TangentSpace(eqx.Module):
         small = ROUNDING_ULPS * jnp.finfo(q.dtype).eps
 
         def unfinished(carry):
-            count, _, _, gap, before = carry
+            count, _, _, _, gap, before = carry
             return (count < MOST_CORRECTIONS) & (gap > small) & (gap < before)
 
         def improve(carry):
-            count, q, _, before, _ = carry
+            count, q, _, _, before, _ = carry
             instant = _at(system, q)
             split = self._split(system, instant)
-            gap = jnp.max(jnp.abs(residual(instant.cuts)))
+            gap = _largest(residual(instant.cuts))
             done = (gap <= small) | (gap >= before)
             closer = jnp.where(done, q, q + self._step(system, instant, split))
-            return count + 1, closer, self._on_velocity_level(system, instant, v, split, sweeps=1), gap, before
+            speeds = self._on_velocity_level(system, instant, v, split, sweeps=1)
+            return count + 1, closer, speeds, split.distance, gap, before
 
-        far = jnp.asarray(jnp.finfo(q.dtype).max, q.dtype)
-        start = (jnp.zeros((), int), q, v, far, 2.0 * far)
-        _, q, v, _, _ = lax.while_loop(unfinished, improve, start)
-        return q, v
+        far, one = jnp.asarray(jnp.finfo(q.dtype).max, q.dtype), jnp.ones((), q.dtype)
+        _, q, v, distance, _, _ = lax.while_loop(unfinished, improve, (jnp.zeros((), int), q, v, one, far, 2.0 * far))
+        return q, v, distance
 
     def _last_step(self, system, closed, q, v):
         """What `close` does near a closed state, as a function to be differentiated."""
@@ -169,10 +212,24 @@ class TangentSpace(eqx.Module):
         return q, self._on_velocity_level(system, instant, v, split, sweeps=2)
 
 
+def _acceleration_at(arguments, q) -> Value:
+    method, system, v, t = arguments
+    gap = _largest(residual(cut_frames(configure(system, q))))
+    q, v, instant, split = method._corrected(system, q, v)
+    return Value((q, method._acceleration(system, t, instant, v, split, sweeps=2)), split.distance, gap)
+
+
+def _closed_state(arguments, q) -> Value:
+    method, system, v, _ = arguments
+    gap = _largest(residual(cut_frames(configure(system, q))))
+    q, v, distance = method._approach(system, q, v)
+    return Value((q, v), distance, gap)
+
+
 @eqx.filter_custom_jvp
 def _close(arguments):
     method, system, q, v = arguments
-    return method._approach(system, q, v)
+    return method._limit(_closed_state, (0, 1), None, system, q, v)[0]
 
 
 @_close.def_jvp

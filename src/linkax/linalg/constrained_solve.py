@@ -22,8 +22,8 @@ class Inverse(NamedTuple):
     - `tangent` T (n, n), `normal` G (n, m), `compliance` S (m, m).
     - `basis`: tangent space, (n, n), zero columns where the normal space is.
     - `rank`: number of independent rows.
-    - `distance`: smallest over largest diagonal of R among them; small near a singular
-      configuration. One without rows.
+    - `distance` d: |R_rr| / |R₁₁|, r the rank here or that of the neighbourhood where it is
+      known; falls to zero in a singular configuration. One without rows.
     """
 
     tangent: Float[Array, "n n"]
@@ -34,7 +34,7 @@ class Inverse(NamedTuple):
     distance: Float[Array, ""]
 
 
-def invert(weight, jacobian, units, tolerance) -> Inverse:
+def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     """Split the space of speeds by J and invert the saddle-point system on it.
 
     **Arguments:**
@@ -44,6 +44,8 @@ def invert(weight, jacobian, units, tolerance) -> Inverse:
     - `jacobian`: J, (m, n), of any rank, redundant and zero rows included.
     - `units`: one unit of each speed, (n,), so that radians and metres compare.
     - `tolerance`: τ; a row is independent where |R_kk| > τ max(|R₁₁|, 1).
+    - `rank_nearby`: the rank at the states around, where it is known; it is larger than the rank
+      of a J that is singular.
     """
     weight, jacobian, units = lax.stop_gradient((weight, jacobian, units))
     rows, n = jacobian.shape
@@ -54,7 +56,9 @@ def invert(weight, jacobian, units, tolerance) -> Inverse:
     if weight is not None:
         weight = weight * units[:, None] * units[None, :]
         # W = M + JᵀDJ is positive definite where M is so on the tangent space only.
-        added = _ratio(jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1), size**4, 0.0)
+        # A row of rounding alone would add as much as any other, and is left out.
+        square = jnp.where(size > tolerance * jnp.max(size, initial=0.0), size**4, 0.0)
+        added = _ratio(jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1), square, 0.0)
         to_metric = _lower_inverse(weight + (jacobian.T * added) @ jacobian)
     if rows == 0:
         tangent, nothing = to_metric.T * units[:, None], jnp.zeros((n, 0), dtype)
@@ -75,14 +79,16 @@ def invert(weight, jacobian, units, tolerance) -> Inverse:
     basis = units[:, None] * (to_metric.T @ q)
     is_normal = jnp.zeros(n, bool).at[:count].set(active)
     tangent = jnp.where(is_normal, 0.0, basis)
-    smallest = jnp.min(jnp.where(active, diagonal, jnp.inf))
+    rank = jnp.sum(active)
+    last = (rank if rank_nearby is None else rank_nearby) - 1
+    smallest = jnp.sum(jnp.where(jnp.arange(count) == last, diagonal, 0.0))
     return Inverse(
         tangent=tangent @ tangent.T,
         normal=jnp.where(is_normal, basis, 0.0)[:, :count] @ rows_inverse.T,
         compliance=rows_inverse @ rows_inverse.T - jnp.diag(added),
         basis=tangent,
-        rank=jnp.sum(active),
-        distance=jnp.where(active[0], _ratio(smallest, diagonal[0], 1.0), 1.0),
+        rank=rank,
+        distance=jnp.where(last >= 0, _ratio(smallest, diagonal[0], 0.0), 1.0),
     )
 
 

@@ -3,6 +3,7 @@
 from typing import Literal, get_args
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from linkax.formulations.tangent_space import TangentSpace
@@ -23,7 +24,11 @@ class Accuracy(eqx.Module):
       equations of motion ("stage"), after every accepted step ("step"), "both" (default), or
       "none". Saved states are corrected always.
     - `rank_tolerance`: τ; a loop row counts as independent where |R_kk| > τ max(|R₁₁|, 1).
-      Default: 1e-10 in double, 1e-5 in single precision.
+      Default: 1e-6 in double, 1e-5 in single precision.
+    - `clearance`: distance d from a singular configuration that the stages of adaptive steps keep
+      where they can, by placing a passage between two of them; 0: no step is placed. d is the
+      smallest over the largest diagonal of R, of the order of the distance itself in radians or
+      lengths of the mechanism.
     - `metric`: "mass" (default) or "identity", see `linkax.TangentSpace`.
 
     **Raises:** `ValueError` for a tolerance that is not a positive, finite number.
@@ -32,30 +37,37 @@ class Accuracy(eqx.Module):
     rtol: np.ndarray
     atol: np.ndarray
     rank_tolerance: np.ndarray | None
+    clearance: np.ndarray
     projection: Projection = eqx.field(static=True)
     metric: Metric = eqx.field(static=True)
 
-    def __init__(self, rtol=1e-8, atol=None, *, projection="both", rank_tolerance=None, metric="mass"):
-        self.rtol = _positive("rtol", rtol)
-        self.atol = self.rtol if atol is None else _positive("atol", atol)
-        self.rank_tolerance = None if rank_tolerance is None else _positive("rank_tolerance", rank_tolerance)
+    def __init__(self, rtol=1e-8, atol=None, *, projection="both", rank_tolerance=None, clearance=1e-2, metric="mass"):
+        self.rtol = _number("rtol", rtol)
+        self.atol = self.rtol if atol is None else _number("atol", atol)
+        self.rank_tolerance = None if rank_tolerance is None else _number("rank_tolerance", rank_tolerance)
+        self.clearance = _number("clearance", clearance, zero=True)
         self.projection = _one_of("projection", projection, get_args(Projection))
         self.metric = _one_of("metric", metric, get_args(Metric))
 
-    def method(self, dtype) -> TangentSpace:
+    def method(self, dtype, rank_nearby=None) -> TangentSpace:
         """The paper's method at this accuracy, for numbers of the given type."""
-        default = 1e-10 if np.finfo(dtype).bits == 64 else 1e-5
-        tolerance = default if self.rank_tolerance is None else self.rank_tolerance
-        return TangentSpace(np.asarray(tolerance, dtype), self.metric)
+        double = np.finfo(dtype).bits == 64
+        either = lambda number, default: jnp.asarray(default if number is None else number, dtype)
+        return TangentSpace(
+            either(self.rank_tolerance, 1e-6 if double else 1e-5),
+            rank_nearby,
+            metric=self.metric,
+        )
 
 
-def _positive(name, value):
+def _number(name, value, zero=False):
     try:
         number = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is {value!r}; it must be a number") from error
-    if number.shape != () or not (np.isfinite(number) and number > 0.0):
-        raise ValueError(f"{name} is {value!r}; it must be one positive, finite number, such as 1e-8")
+    if number.shape != () or not (np.isfinite(number) and (number > 0.0 or (zero and number == 0.0))):
+        kind = "non-negative" if zero else "positive"
+        raise ValueError(f"{name} is {value!r}; it must be one {kind}, finite number, such as 1e-8")
     return number
 
 

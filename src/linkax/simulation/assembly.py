@@ -9,16 +9,20 @@ from jax import lax
 from linkax.equations.kinematics import configure
 from linkax.equations.loops import Gap, as_if_closed, cut_frames, gaps, jacobian, residual
 from linkax.equations.system import System, system_of
+from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import constrained_solve, invert
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known, number
 from linkax.simulation.accuracy import BALANCED
+from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State, joint_coordinates, wrapped
 
 MOST_STEPS = 100
 LONGEST_STEP = 0.7  # radians, or lengths of the mechanism
 STEP_FRACTIONS = 0.5 ** np.arange(6)
 SMALL = 1e-15
+TURNS = 10
+BESIDE = 1e-2
 CLOSED = 1e-9  # remaining gap, relative to the mechanism's length
 
 
@@ -38,11 +42,13 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None) -
 
     Coordinates that are not held change as little as the loops allow from the guess, and
     speeds that are not held are the smallest that the loops allow, both measured in radians
-    and in lengths of the mechanism.
+    and in lengths of the mechanism. In a singular configuration, where branches of the motion
+    cross, speeds lie on the branch nearest to these; give more of them to choose another.
 
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
-    cannot be closed; `ValueError` for an unknown joint or a wrong number. Inside JAX
-    transformations nothing is raised; `linkax.simulate` marks such a state in its result.
+    cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
+    `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
+    raised; `linkax.simulate` marks such a state in its result.
     """
     positions, speeds = _by_joint(mechanism, positions, "position"), _by_joint(mechanism, speeds, "speed")
     guess = _by_joint(mechanism, guess, "guess")
@@ -51,7 +57,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None) -
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
     state, remainder = _assemble(mechanism, positions, speeds, guess)
     if known(state.q) is not None:
-        _raise_if_open(mechanism, jax.tree.map(np.asarray, remainder))
+        _raise_if_open(mechanism, state, jax.tree.map(np.asarray, remainder))
     return state
 
 
@@ -66,7 +72,7 @@ def _by_joint(mechanism, values, what):
     return checked
 
 
-def _raise_if_open(mechanism, remainder):
+def _raise_if_open(mechanism, state, remainder):
     topology = mechanism.topology
     cuts = topology.joints[topology.num_bodies :]
     for name, distance, angle in zip(cuts, remainder.gap.distance, remainder.gap.angle, strict=True):
@@ -84,6 +90,14 @@ def _raise_if_open(mechanism, remainder):
                     f"the {what} asked of joint {name!r} is missed by {np.max(np.abs(miss)):.6g}; the loops do not "
                     f"allow it together with the other {what}s given, so ask for fewer"
                 )
+    if not remainder.off_branch <= ON_BRANCH * BALANCED.method(state.q.dtype).rank_tolerance:
+        system = system_of(mechanism, state.q.dtype)
+        basis = Crossing.at(system, state.q, BALANCED.method(state.q.dtype).rank_tolerance).inverse.basis
+        names = ", ".join(map(repr, moving_joints(system, state.q, basis)))
+        raise AssemblyError(
+            "the configuration is singular, and the speeds asked lie on no branch of the motion; its branches cross "
+            f"in the motion of joints {names}, so ask for the speeds of other joints among them, or of fewer"
+        )
 
 
 class _Remainder(eqx.Module):
@@ -93,6 +107,7 @@ class _Remainder(eqx.Module):
     length: jax.Array
     positions: dict[str, jax.Array]
     speeds: dict[str, jax.Array]
+    off_branch: jax.Array
 
 
 class _Demand(eqx.Module):
@@ -162,6 +177,43 @@ class _Demand(eqx.Module):
         begin = (jnp.zeros((), int), q, self.size(q), jnp.asarray(jnp.inf, q.dtype))
         return lax.while_loop(unfinished, improve, begin)[1]
 
+    def speeds(self, q):
+        """The smallest speeds with the rates held, or near to them on a branch of the motion.
+
+        Newton steps from rest on J v = 0, the rates held, and γ(v, v) in the range of J; the first
+        leads to the smallest speeds, and where the rank of J is constant, these are on a branch.
+
+        **Returns:** speeds, (n_v,); the smallest speeds, (n_v,); and how far the former are from
+        such a branch, relative to the speeds.
+        """
+        system, tolerance = self.system, BALANCED.method(q.dtype).rank_tolerance
+        rates = jnp.concatenate([jnp.zeros(system.topology.num_rows), *self.held.values()])
+        largest = jnp.max(jnp.abs(rates), initial=0.0)
+        scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
+        crossing, rows = Crossing.at(system, q, tolerance), self.jacobian(q)
+        metric = jnp.diag(system.coordinate_units**-2)
+        # A little beside the smallest speeds, which may lie just between two branches.
+        beside = BESIDE * crossing.inverse.basis @ jnp.ones_like(q)
+
+        def turn(v, first):
+            off, slopes = crossing.off_branch(v), jax.jacfwd(crossing.off_branch)(v)
+            rest = jnp.concatenate([rates / scale - rows @ v, -off])
+            slopes = jnp.concatenate([rows, slopes])
+            inverse = invert(None, slopes, system.coordinate_units, tolerance)
+            v = v + constrained_solve(inverse, metric, slopes, jnp.zeros_like(v), rest)[0]
+            return v + jnp.where(first & (_off(crossing, v) > ON_BRANCH * tolerance), beside, 0.0), v
+
+        v, turns = lax.scan(turn, jnp.zeros_like(q), jnp.arange(TURNS) == 0)
+        missed = jnp.max(jnp.abs(rates / scale - rows @ v), initial=0.0)
+        return scale * v, scale * turns[0], jnp.maximum(_off(crossing, v), missed)
+
+
+def _off(crossing, v):
+    """How far speeds are from a branch, relative to their square."""
+    fastest = jnp.max(jnp.abs(v / crossing.configuration.system.coordinate_units), initial=0.0)
+    off = jnp.max(jnp.abs(crossing.off_branch(v)), initial=0.0)
+    return jnp.where(fastest > 0.0, off / jnp.where(fastest > 0.0, fastest, 1.0) ** 2, 0.0)
+
 
 @eqx.filter_jit
 def _assemble(mechanism, positions, speeds, guess):
@@ -177,13 +229,13 @@ def _assemble(mechanism, positions, speeds, guess):
     met = placed.size(q) <= CLOSED
     q = q + jnp.where(met, placed.least_change(q, -placed.rows(q)), 0.0)
 
-    asked = jnp.concatenate([jnp.zeros(topology.num_rows), *speeds.values()])
-    v = moving.least_change(q, asked)
-    reached = jax.jvp(moving.misses, (q,), (v,))[1]
+    v, smallest, off_branch = moving.speeds(q)
+    reached = jax.jvp(moving.misses, (q,), (smallest,))[1]
     remainder = _Remainder(
         gap=gaps(cut_frames(configure(system, q))),
         length=system.length,
         positions=placed.misses(q),
         speeds={name: reached[name] - speeds[name] for name in speeds},
+        off_branch=off_branch,
     )
     return State(q, v), remainder

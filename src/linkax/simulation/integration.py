@@ -1,9 +1,9 @@
 """What diffrax lacks for motion on a manifold: a solver that projects, a step control that knows it.
 
-The two work as a pair: `Projected` corrects the state after each step and passes the distance
-from the nearest singular configuration on with its error estimate, `MechanismControl` measures
-that estimate in the units of the mechanism and takes off the rounding noise that a singular
-configuration amplifies.
+The two work as a pair: `Projected` corrects the state after each step, leaves of the error
+estimate what remains in the corrected state, and finds how close the stages came to a singular
+configuration; `MechanismControl` measures errors in the units of the mechanism, takes off what
+rounding alone causes, and places steps so that no stage falls close to a singular configuration.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -12,67 +12,112 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from linkax.equations.system import System
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
+from linkax.simulation.accuracy import Accuracy
+from linkax.simulation.state import State
 
-NOISE_FACTOR = 100.0
-LARGEST_NOISE = 1e-8
+NOISE_ULPS = 1.0
 FIRST_STEP = 1e-3  # of the whole time
 FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 SMALLEST_STEP_ULPS = 4.0
+MOST_RETRIES = 4
+FEASIBLE = 0.1  # of a step's first distance: what any step can keep from a passage
+BEYOND = 1.5  # how far after its end a step may leave a passage, in steps
 
 
 class Problem(eqx.Module):
-    """The right-hand side's arguments: a mechanism, its numbers, and the method that solves it."""
+    """The right-hand side's arguments: a mechanism, its numbers, the method that solves it, how well.
+
+    diffrax integrates one vector: q, v, and the time integral of the distance d from the nearest
+    singular configuration, whose rates tell a step how close its stages came. From a state that
+    is not `sound`, no step is taken.
+    """
 
     mechanism: Mechanism
     system: System
     method: TangentSpace
-    projection: str = eqx.field(static=True)
+    accuracy: Accuracy
+    sound: Bool[Array, ""] = True
 
-    def derivative(self, t, state):
-        """(q̇, v̇) for diffrax."""
-        correct = self.projection in ("both", "stage")
-        return _apart(lambda q, v: self.method.derivative(self.system, t, q, v, correct), state, _undefined(state))
+    def packed(self, q, v, integral=0.0):
+        """The vector that diffrax integrates."""
+        return jnp.concatenate([q, v, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
 
-    def close(self, state):
-        """The state on the manifold to rounding."""
-        return self.method.close(self.system, *state)
+    def unpacked(self, y):
+        """q and v of such vectors, (..., n_q + n_v + 1)."""
+        return y[..., : self.system.topology.num_coordinates], y[..., self.system.topology.num_coordinates : -1]
+
+    def derivative(self, t, y):
+        """(q̇, v̇, d) for diffrax."""
+        correct = self.accuracy.projection in ("both", "stage")
+
+        def rates(y):
+            return self.packed(*self.method.derivative(self.system, t, *self.unpacked(y), correct))
+
+        return _apart(rates, y, jnp.full_like(y, jnp.nan))
+
+    def close(self, y):
+        """The `State` on the manifold to rounding."""
+        return State(*self.method.close(self.system, *self.unpacked(y)))
 
 
-def _apart(function, state, otherwise):
-    """function(q, v), as a branch of its own, taken where the state is finite.
+def _apart(function, y, otherwise):
+    """function(y), as a branch of its own, taken where y is finite.
 
     The branch is for speed: XLA runs a computation on the CPU without the cost of scheduling
     its parts (half of the time for a small mechanism) where it touches small arrays only, and
     inlined into a solver's step it would touch the tables of the solver.
     """
-    q, v = state
-    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
-    return lax.cond(finite, function, lambda q, v: otherwise, q, v)
-
-
-def _undefined(state):
-    return jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), state)
+    return lax.cond(jnp.all(jnp.isfinite(y)), function, lambda y: otherwise, y)
 
 
 class StepError(NamedTuple):
-    """A step's error estimate, and the smaller d of its two ends (see `Inverse.distance`).
+    """What `Projected` tells `MechanismControl` of a step.
 
-    Both ends count: at a start exactly in a singular configuration the rank is lower, and the
-    distance is that of the rows left.
+    - `error`: estimate of q and v, or None.
+    - `leaves`: distance d from the nearest singular configuration where the step begins.
+    - `passes`: the smallest d of its other stages. `retry`: by how much to change the step so that
+      what passes there falls between two stages.
     """
 
     error: Any
-    distance: Float[Array, ""]
+    leaves: Float[Array, ""]
+    passes: Float[Array, ""]
+    retry: Float[Array, ""]
+
+
+def placements(nodes) -> np.ndarray:
+    """By how much to change a step that meets an event at one of its nodes.
+
+    For each node of a Runge-Kutta tableau in (0, 1] the factor that brings the event as far from
+    all nodes as possible, into the middle of a gap between later ones or after the step's end.
+    """
+    nodes = np.asarray(nodes, dtype=float)
+    ends = np.unique([*nodes[nodes > 0.0], BEYOND])
+    middle, clearance = (ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2
+
+    def placement(node):
+        later = middle >= node
+        return node / middle[later][np.argmax((clearance / middle)[later])]
+
+    return np.array([placement(node) if node > 0.0 else 1.0 for node in nodes])
 
 
 class Projected(diffrax.AbstractAdaptiveSolver):
     """Any diffrax solver, with the state put back on the closed loops after each step.
+
+    The estimate of the step's error is put there too: only its part in the tangent space remains
+    in the state. The rest is mostly rounding, which a singular configuration amplifies and the
+    correction removes; a step control that saw it would stall.
+
+    The solver's state holds the distance from a singular configuration at the end of the last
+    step, and the smallest so far at any stage.
 
     Not an `AbstractWrappedSolver`: diffrax would look through it for fields it does not have.
     """
@@ -106,21 +151,48 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args), jnp.ones((), args.system.dtype)
+        one = jnp.ones((), args.system.dtype)
+        return self.solver.init(terms, t0, t1, y0, args), one, one
 
     def func(self, terms, t0, y0, args):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        inner, distance = solver_state
+        inner, leaves, closest = solver_state
         y1, error, dense_info, inner, result = self.solver.step(terms, t0, t1, y0, args, inner, made_jump)
-        next_distance = distance
+        stages = self._stages(dense_info, t1 - t0)
         if self.after_step:
-            q, v, next_distance = _apart(
-                lambda q, v: args.method.correct(args.system, q, v), y1, (*_undefined(y1), distance)
-            )
-            y1 = (q, v)
-        return y1, StepError(error, jnp.minimum(distance, next_distance)), dense_info, (inner, next_distance), result
+            y1, error, arrives = _corrected(args, y1, error)
+        else:
+            arrives = leaves if stages is None else stages[-1]
+            error = None if error is None else args.unpacked(error)
+        if stages is None:
+            leaves_now, passes, retry = leaves, arrives, jnp.ones_like(arrives)
+        else:
+            nearest = jnp.argmin(stages[1:])
+            leaves_now, passes = stages[0], stages[1:][nearest]
+            retry = jnp.asarray(placements(self.solver.tableau.c), passes.dtype)[nearest]
+        closest = jnp.minimum(closest, jnp.minimum(passes, arrives))
+        return y1, StepError(error, leaves_now, passes, retry), dense_info, (inner, arrives, closest), result
+
+    def _stages(self, dense_info, duration):
+        """Distances at the stages of a Runge-Kutta step, where this is one."""
+        if not (isinstance(dense_info, dict) and "k" in dense_info and hasattr(self.solver, "tableau")):
+            return None
+        return lax.stop_gradient(dense_info["k"][:, -1] / duration)
+
+
+def _corrected(problem, y1, error):
+    """State and error estimate after the correction, and the distance d there."""
+    errors = () if error is None else problem.unpacked(error)
+
+    def correct(y):
+        q, v, errors_left, distance = problem.method.correct(problem.system, *problem.unpacked(y), errors)
+        return problem.packed(q, v, y[-1]), errors_left, distance
+
+    undefined = jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), (y1, errors))
+    y1, errors, distance = _apart(correct, y1, (*undefined, jnp.ones((), y1.dtype)))
+    return y1, None if error is None else errors, distance
 
 
 class MechanismControl(diffrax.AbstractStepSizeController):
@@ -129,7 +201,12 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     The controller inside sees coordinates in radians and lengths of the mechanism, all of
     magnitude one, and speeds in the same units, all of the magnitude of the largest: a joint
     that has made many turns, or that stands still for a moment, does not change the tolerance.
-    From the error it sees, noise of rounding is taken off that no smaller step would lower.
+    The error it sees has rounding taken off, which no smaller step would lower, and which grows
+    near a singular configuration.
+
+    An adaptive step that has a stage close to a singular configuration is tried again, shorter,
+    so that the configuration falls between two stages. Where a few tries do not help, or the step
+    begins in the singular configuration, it is left as it is.
     """
 
     controller: diffrax.AbstractStepSizeController
@@ -137,30 +214,52 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     def wrap(self, direction):
         return MechanismControl(self.controller.wrap(direction))
 
+    @property
+    def _is_adaptive(self):
+        inner = self.controller
+        while hasattr(inner, "controller"):
+            inner = inner.controller
+        return isinstance(inner, diffrax.AbstractAdaptiveStepSizeController)
+
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        if dt0 is None and isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
+        _, v = args.unpacked(y0)
+        if dt0 is None and self._is_adaptive:
             # Not diffrax's choice, which would compile the equations of motion twice more.
-            fastest = jnp.max(jnp.abs(y0[1] / args.system.coordinate_units), initial=0.0)
+            fastest = jnp.max(jnp.abs(v / args.system.coordinate_units), initial=0.0)
             turning = jnp.where(fastest > 0.0, FIRST_TURN / jnp.where(fastest > 0.0, fastest, 1.0), jnp.inf)
             dt0 = jnp.minimum(FIRST_STEP * (t1 - t0), turning)
             dt0 = lax.stop_gradient(dt0)
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        first, state = self.controller.init(terms, t0, t1, args.unpacked(y0), dt0, args, func, error_order)
+        return first, (state, jnp.zeros((), int))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         units = args.system.coordinate_units
+        scales = tuple(_magnitudes(args.unpacked(y), units) for y in (y0, y1_candidate))
+        scaled = None
         if y_error.error is not None:
-            noise = _noise(y_error.distance)
-            q_error, v_error = (_less(error / units, noise) for error in y_error.error)
-            scales = _magnitudes(y0, units), _magnitudes(y1_candidate, units)
-            scaled = q_error, v_error
-        else:
-            scaled, scales = None, (y0, y1_candidate)
-        keep, next_t0, next_t1, jump, controller_state, result = self.controller.adapt_step_size(
-            t0, t1, *scales, args, scaled, error_order, controller_state
+            noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.rank_tolerance)
+            scaled = tuple(_less(e / units, noise * scale) for e, scale in zip(y_error.error, scales[0], strict=True))
+        before, retries = controller_state
+        keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
+            t0, t1, *scales, args, scaled, error_order, before
         )
-        stalled = next_t1 - next_t0 <= SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t1), 1e-3)
-        result = diffrax.RESULTS.where(stalled & jnp.logical_not(keep), diffrax.RESULTS.dt_min_reached, result)
-        return keep, next_t0, next_t1, jump, controller_state, result
+        # A step size that is not a number does not proceed either.
+        proceeds = next_t1 - next_t0 > SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t1), 1e-3)
+        keep = keep & args.sound
+        result = diffrax.RESULTS.where(keep | (proceeds & args.sound), result, diffrax.RESULTS.dt_min_reached)
+        if not self._is_adaptive:
+            return keep, next_t0, next_t1, jump, (after, retries), result
+        near = jnp.minimum(args.accuracy.clearance, FEASIBLE * y_error.leaves)
+        again = keep & (y_error.passes < near) & (retries < MOST_RETRIES)
+        either = lambda retry, otherwise: jax.tree.map(lambda a, b: jnp.where(again, a, b), retry, otherwise)
+        return (
+            keep & jnp.logical_not(again),
+            either(t0, next_t0),
+            either(t0 + y_error.retry * (t1 - t0), next_t1),
+            jump & jnp.logical_not(again),
+            (either(before, after), jnp.where(again, retries + 1, jnp.where(keep, 0, retries))),
+            result,
+        )
 
 
 def _magnitudes(state, units):
@@ -170,13 +269,14 @@ def _magnitudes(state, units):
     return jnp.where(jnp.isfinite(q), 1.0, q), jnp.broadcast_to(fastest, v.shape)
 
 
-def _noise(distance):
-    """Rounding in v̇, amplified by the distance from a singular configuration."""
-    epsilon = jnp.finfo(distance.dtype).eps
-    return jnp.minimum(NOISE_FACTOR * epsilon / distance**2, LARGEST_NOISE)
+def _noise(distance, rank_tolerance):
+    """Rounding along the motion, relative: it grows like 1/d, up to where rows count as dependent.
+
+    Across the motion it grows like 1/d², but that the correction takes off.
+    """
+    return NOISE_ULPS * jnp.finfo(distance.dtype).eps / jnp.maximum(distance, rank_tolerance)
 
 
 def _less(error, noise):
-    size = jnp.max(jnp.abs(error), initial=0.0)
-    kept = jnp.where(size > 0.0, jnp.maximum(1.0 - noise / jnp.where(size > 0.0, size, 1.0), 0.0), 1.0)
-    return error * lax.stop_gradient(kept)
+    """An error less the noise in it."""
+    return jnp.where(jnp.abs(error) > noise, error - jnp.sign(error) * noise, 0.0 * error)

@@ -10,6 +10,14 @@ class RESULTS(diffrax.RESULTS):
         "The loops of the initial state do not close. Make the state with `linkax.assemble`, which says which "
         "joint is open, and how far."
     )
+    no_branch = (
+        "The initial configuration is singular, and the initial speeds lie on no branch of the motion. Make the state "
+        "with `linkax.assemble`, which finds speeds on a branch."
+    )
+    not_unique = (
+        "The mechanism starts at rest in a singular configuration, and the forces drive it along no single branch: "
+        "its motion is not unique. Give it speeds, or start a little along the branch it should take."
+    )
     not_finite = "The initial state or the numbers of the mechanism are not finite."
 
 

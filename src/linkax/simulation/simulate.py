@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from linkax.equations.kinematics import configure
-from linkax.equations.loops import cut_frames, gaps
 from linkax.equations.system import system_of
+from linkax.formulations.branches import Crossing
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.integration import MechanismControl, Problem, Projected
+from linkax.simulation.outset import depart, moving_joints
 from linkax.simulation.results import RESULTS, SimulationError
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
@@ -94,7 +94,7 @@ def simulate(
         dtype,
     )
     if throw and known(solution.ts) is not None:
-        _raise_if_failed(solution)
+        _raise_if_failed(solution, state)
     return solution
 
 
@@ -138,7 +138,7 @@ class _OnManifold(eqx.Module):
     function: callable
 
     def __call__(self, t, y, problem, **unused):
-        return self.function(t, State(*problem.close(y)), problem.mechanism)
+        return self.function(t, problem.close(y), problem.mechanism)
 
 
 def _wrapped_saves(subs):
@@ -179,26 +179,31 @@ def _simulate(
     max_steps,
     dtype,
 ):
-    mechanism, state, t0, t1, dt0, saveat, controller = _cast(
-        (mechanism, state, t0, t1, dt0, saveat, controller), dtype
+    mechanism, state, t0, t1, dt0, accuracy, saveat, controller = _cast(
+        (mechanism, state, t0, t1, dt0, accuracy, saveat, controller), dtype
     )
-    problem = Problem(mechanism, system_of(mechanism, dtype), accuracy.method(dtype), accuracy.projection)
+    system = system_of(mechanism, dtype)
+    method = accuracy.method(dtype)
+    outset = depart(method, system, t0, state)
+    method = eqx.tree_at(lambda m: m.rank_nearby, method, outset.rank, is_leaf=lambda leaf: leaf is None)
+    problem = Problem(mechanism, system, method, accuracy, outset.sound)
     if saveat is None:
         saveat = diffrax.SaveAt(ts=jnp.linspace(t0, t1, DEFAULT_SAVES, dtype=dtype))
     plain = isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is _SAVE_STATE
     subs = saveat.subs if plain else _wrapped_saves(saveat.subs)
     saveat = eqx.tree_at(
-        lambda s: s.subs, saveat, (subs, diffrax.SubSaveAt(t1=True)), is_leaf=lambda leaf: leaf is None
+        lambda s: (s.subs, s.solver_state),
+        saveat,
+        ((subs, diffrax.SubSaveAt(t1=True)), True),
+        is_leaf=lambda leaf: leaf is None,
     )
-    start = problem.close((state.q, state.v))
-    gap = gaps(cut_frames(configure(problem.system, start[0])))
     found = diffrax.diffeqsolve(
         diffrax.ODETerm(_derivative),
         solver,
         t0,
         t1,
         dt0,
-        start,
+        problem.packed(outset.state.q, outset.state.v),
         problem,
         saveat=saveat,
         stepsize_controller=controller,
@@ -208,14 +213,13 @@ def _simulate(
         throw=False,
         progress_meter=progress_meter,
     )
-    (ts, _), (ys, (q_end, v_end)) = found.ts, found.ys
+    (ts, _), (ys, y_end) = found.ts, found.ys
     if plain:
-        every = jax.tree.map(lambda saved, end: jnp.concatenate([saved, end]), ys, (q_end, v_end))
-        q, v = jax.vmap(lambda q, v: problem.close((q, v)))(*every)
-        end, saved = State(q[-1], v[-1]), jnp.isfinite(ts)[:, None]
-        q, v, ys = jnp.where(saved, q[:-1], jnp.inf), jnp.where(saved, v[:-1], jnp.inf), None
+        states = jax.vmap(problem.close)(jnp.concatenate([ys, y_end]))
+        end, saved = State(states.q[-1], states.v[-1]), jnp.isfinite(ts)[:, None]
+        q, v, ys = jnp.where(saved, states.q[:-1], jnp.inf), jnp.where(saved, states.v[:-1], jnp.inf), None
     else:
-        q, v, end = None, None, State(*problem.close((q_end[0], v_end[0])))
+        q, v, end = None, None, problem.close(y_end[0])
     return Solution(
         mechanism=mechanism,
         accuracy=accuracy,
@@ -226,7 +230,9 @@ def _simulate(
         t_end=found.ts[1][0],
         end=end,
         stats=found.stats,
-        result=_result(found.result, start, gap, problem.system, controller),
+        result=_result(found.result, outset),
+        rank_nearby=outset.rank,
+        closest=found.solver_state[2],
         interpolation=found.interpolation,
     )
 
@@ -235,22 +241,24 @@ def _derivative(t, y, problem):
     return problem.derivative(t, y)
 
 
-def _result(result, start, gap, system, controller):
+def _result(result, outset):
+    """The first of what is wrong at the start, else how the integration ended."""
     result = RESULTS.promote(result)
-    tolerance = jnp.sqrt(jnp.finfo(system.dtype).eps)
-    closed = jnp.all(gap.distance <= tolerance * system.length) & jnp.all(gap.angle <= tolerance)
-    finite = jnp.all(jnp.isfinite(start[0])) & jnp.all(jnp.isfinite(start[1]))
-    result = RESULTS.where(closed, result, RESULTS.not_closed)
-    return RESULTS.where(finite, result, RESULTS.not_finite)
+    result = RESULTS.where(outset.unique, result, RESULTS.not_unique)
+    result = RESULTS.where(outset.on_branch, result, RESULTS.no_branch)
+    result = RESULTS.where(outset.closed, result, RESULTS.not_closed)
+    return RESULTS.where(outset.finite, result, RESULTS.not_finite)
 
 
-def _raise_if_failed(solution):
-    okay = (solution.result == RESULTS.successful) | (solution.result == RESULTS.event_occurred)
-    failed = ~np.asarray(okay)
-    if not np.any(failed):
+def _raise_if_failed(solution, state):
+    if (solution.result == RESULTS.successful) | (solution.result == RESULTS.event_occurred):
         return
-    member = "" if failed.ndim == 0 else f" (member {np.argwhere(failed)[0].tolist()} of the batch)"
-    index = tuple(np.argwhere(failed)[0])
-    time = float(np.asarray(solution.t_end)[index])
-    reason = RESULTS[jax.tree.map(lambda leaf: leaf[index], solution.result)]
-    raise SimulationError(f"simulation stopped at t = {time:.6g} s{member}: {reason}", solution)
+    at_start = (RESULTS.not_finite, RESULTS.not_closed, RESULTS.no_branch, RESULTS.not_unique)
+    when = "before it began" if any(solution.result == r for r in at_start) else f"at t = {float(solution.t_end):.6g} s"
+    reason = f"simulation stopped {when}: {RESULTS[solution.result]}"
+    if (solution.result == RESULTS.no_branch) | (solution.result == RESULTS.not_unique):
+        method, system = solution.accuracy.method(state.q.dtype), system_of(solution.mechanism, state.q.dtype)
+        crossing = Crossing.at(system, state.q, method.rank_tolerance)
+        names = moving_joints(system, state.q, crossing.inverse.basis)
+        reason += f" The branches cross in the motion of joints {', '.join(map(repr, names))}."
+    raise SimulationError(reason, solution)

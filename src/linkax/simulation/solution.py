@@ -16,6 +16,7 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number
 from linkax.simulation.accuracy import Accuracy
+from linkax.simulation.integration import Problem
 from linkax.simulation.results import RESULTS
 from linkax.simulation.state import State, joint_coordinates
 from linkax.spatial.rotations import cross, rotate
@@ -64,6 +65,8 @@ class Solution(eqx.Module):
     - `t_end`, `end`: the time reached and the `State` there.
     - `stats`: as in diffrax: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `result`: a `linkax.RESULTS`; equal to `RESULTS.successful` where all went well.
+    - `rank_nearby`: rank along the motion; in a singular configuration `rank` is smaller.
+    - `closest`: smallest distance from a singular configuration at any stage of any step.
 
     All that is read by the methods below comes as arrays with times as the first axis, in ground
     axes and SI units. A solution from `jax.vmap` has the batch axes before that.
@@ -79,6 +82,8 @@ class Solution(eqx.Module):
     end: State
     stats: dict[str, Any]
     result: RESULTS
+    rank_nearby: Int[Array, "*batch"]
+    closest: Float[Array, "*batch"]
     interpolation: Any
 
     def position(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
@@ -159,6 +164,10 @@ class Solution(eqx.Module):
         """Number of independent loop rows."""
         return _over_times(_rank, self)
 
+    def singularity_distance(self) -> Float[Array, "*batch n_t"]:
+        """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
+        return _over_times(_distance, self)
+
     def evaluate(self, t) -> State:
         """The state at a time [s] between the steps; needs `saveat=SaveAt(dense=True)`."""
         if self.interpolation is None:
@@ -192,7 +201,7 @@ def _over_times(function, solution, *details):
 
     def of_member(solution, *details):
         system = system_of(solution.mechanism, solution.q.dtype)
-        method = solution.accuracy.method(solution.q.dtype)
+        method = solution.accuracy.method(solution.q.dtype, solution.rank_nearby)
         of_time = lambda t, q, v: function(_Instant(system, method, t, q, v), *details)
         return jax.vmap(of_time)(solution.ts, solution.q, solution.v)
 
@@ -204,9 +213,9 @@ def _over_times(function, solution, *details):
 @eqx.filter_jit
 def _evaluate(solution, t):
     dtype = solution.end.q.dtype
-    system = system_of(solution.mechanism, dtype)
-    q, v = solution.interpolation.evaluate(jnp.asarray(t, dtype))
-    return State(*solution.accuracy.method(dtype).close(system, q, v))
+    system, method = system_of(solution.mechanism, dtype), solution.accuracy.method(dtype, solution.rank_nearby)
+    y = solution.interpolation.evaluate(jnp.asarray(t, dtype))
+    return Problem(solution.mechanism, system, method, solution.accuracy).close(y)
 
 
 def _arm(configuration, body, point):
@@ -284,3 +293,7 @@ def _largest(instant):
 
 def _rank(instant):
     return instant.dynamics.rank
+
+
+def _distance(instant):
+    return instant.dynamics.distance

@@ -1,0 +1,62 @@
+"""Branches of motion that cross in a singular configuration: which one a state is on.
+
+Where the rank of J falls, more speeds satisfy J v = 0 than motions exist. A motion has an
+acceleration, so γ must lie in the range of J: uᵀγ(v, v) = 0 for every u with uᵀJ = 0, quadratic
+equations for the speeds, whose solutions are the branches.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from linkax.equations.kinematics import Configuration, configure, move
+from linkax.equations.loops import Cuts, bias, cut_frames, jacobian
+from linkax.equations.system import System
+from linkax.linalg.constrained_solve import Inverse, invert
+from linkax.linalg.pivoted_qr import pivoted_qr
+
+OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
+
+
+class Crossing(eqx.Module):
+    """A configuration as a crossing of branches; of one branch alone where the rank of J is constant.
+
+    - `jacobian`: J, (m, n_v), and `inverse`, its split of the space of speeds, in any metric.
+    """
+
+    configuration: Configuration
+    cuts: Cuts
+    jacobian: Float[Array, "m n_v"]
+    inverse: Inverse
+
+    @staticmethod
+    def at(system: System, q, rank_tolerance) -> "Crossing":
+        """At coordinates q, split in the identity metric."""
+        configuration = configure(system, q)
+        cuts = cut_frames(configuration)
+        rows = jacobian(cuts)
+        return Crossing(configuration, cuts, rows, invert(None, rows, system.coordinate_units, rank_tolerance))
+
+    def _outside(self, rows):
+        """Rows of which the part that J reaches is taken off."""
+        return rows - self.jacobian @ (self.inverse.normal @ rows)
+
+    def _bias(self, v):
+        return bias(self.cuts, move(self.configuration, v))
+
+    def off_branch(self, v) -> Float[Array, " m"]:
+        """The part of γ(v, v) outside the range of J: zero for speeds on a branch."""
+        return self._outside(self._bias(v))
+
+    def rank_along(self, v) -> Int[Array, ""]:
+        """The rank of J at configurations next to this one along v.
+
+        First-order perturbation: rank(J) + rank(Uᵀ J̇ N) with U, N the null spaces of Jᵀ and J.
+        """
+        fastest = jnp.max(jnp.abs(v / self.configuration.system.coordinate_units), initial=0.0)
+        direction = v / jnp.where(fastest > 0.0, fastest, 1.0)
+        # γ = −J̇ v is quadratic in v, so its derivative is −2 J̇.
+        growth = -0.5 * jax.jacfwd(self._bias)(direction)
+        opening = self._outside(growth) @ self.inverse.basis
+        return self.inverse.rank + jnp.sum(jnp.abs(jnp.diagonal(pivoted_qr(opening).r)) > OPENING)

@@ -1,0 +1,83 @@
+"""What a state is, before motion starts from it: closed, on a branch of the motion, unique."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Int
+
+from linkax.equations.loops import gaps
+from linkax.equations.system import System
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.simulation.state import State, joint_coordinates
+
+MOVES = 1e-6  # of the largest speed
+ON_BRANCH = 10.0  # rank tolerances that speeds may be off a branch, relative to their square
+
+
+class Outset(NamedTuple):
+    """A state that motion starts from, put on the closed loops.
+
+    - `rank`: of J at the states next to it along the motion.
+    - `finite`, `closed`; `on_branch`: the speeds lie on a branch of the motion; `unique`: so
+      does, at rest, the acceleration.
+    """
+
+    state: State
+    rank: Int[Array, ""]
+    finite: Bool[Array, ""]
+    closed: Bool[Array, ""]
+    on_branch: Bool[Array, ""]
+    unique: Bool[Array, ""]
+
+    @property
+    def sound(self) -> Bool[Array, ""]:
+        """Motion can start from here."""
+        return self.finite & self.closed & self.on_branch & self.unique
+
+
+def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
+    """Close a state and find the rank around it.
+
+    At rest the motion departs along the acceleration. In a singular configuration that is free
+    to take any direction that J leaves; on a branch only if the loops have no force that turns it.
+    """
+    q, v = method.close(system, state.q, state.v)
+    start = State(q, v)
+    if system.topology.num_rows == 0:
+        finite, true = jnp.all(jnp.isfinite(jnp.concatenate([q, v]))), jnp.ones((), bool)
+        return Outset(start, jnp.zeros((), int), finite, true, true, true)
+    # All that follows only decides, and has no derivative.
+    method, system, t, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, q, v))
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
+    crossing, acceleration = method.departure(system, t, q)
+    gap = gaps(crossing.cuts)
+    small = jnp.sqrt(jnp.finfo(system.dtype).eps)
+    # Rows that are not quite dependent contradict each other by as much.
+    slight = ON_BRANCH * method.rank_tolerance
+    size = lambda speeds: jnp.max(jnp.abs(speeds / system.coordinate_units), initial=0.0)
+    at_rest = size(v) ** 2 <= jnp.finfo(system.dtype).eps * size(acceleration)
+    direction = jnp.where(at_rest, acceleration, v)
+    off = jnp.max(jnp.abs(crossing.off_branch(direction)), initial=0.0)
+    on_branch = off <= slight * size(direction) ** 2
+    return Outset(
+        state=start,
+        rank=crossing.rank_along(direction),
+        finite=finite,
+        closed=jnp.all(gap.distance <= small * system.length) & jnp.all(gap.angle <= small),
+        on_branch=on_branch | at_rest,
+        unique=on_branch | jnp.logical_not(at_rest),
+    )
+
+
+def moving_joints(system: System, q, directions) -> list[str]:
+    """Names of the joints, in the tree or cut, that move in some of the directions, (n_v, k)."""
+    size = np.max(np.abs(directions), initial=0.0)
+
+    def moves(name):
+        change = jax.jacfwd(lambda q: joint_coordinates(system, name, q))(q) @ directions
+        return np.max(np.abs(change), initial=0.0) > MOVES * size
+
+    return [name for name in system.topology.joints if moves(name)]

@@ -1,0 +1,132 @@
+"""The step control alone, on steps that are made up."""
+
+from types import SimpleNamespace
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+from linkax.simulation.integration import MechanismControl, StepError, placements
+
+ARGS = SimpleNamespace(
+    system=SimpleNamespace(coordinate_units=jnp.array([1.0, 1e3])),
+    accuracy=lx.Accuracy(rtol=1e-8),
+    method=lx.Accuracy().method(np.float64),
+    unpacked=lambda y: (y[:2], y[2:4]),
+    sound=True,
+)
+Y = jnp.array([1.0, 2e3, 3.0, 4e3, 0.0])
+FAR = StepError((jnp.zeros(2), jnp.zeros(2)), jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(0.5))
+CONTROLLERS = [
+    diffrax.PIDController(rtol=1e-8, atol=1e-8),
+    diffrax.ClipStepSizeController(diffrax.PIDController(rtol=1e-8, atol=1e-8), jump_ts=np.array([0.7])),
+]
+
+
+def adapt(controller, error, t0=0.0, t1=1.0, retries=0):
+    control = MechanismControl(controller)
+    t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+    _, (inner, _) = control.init(None, t0, 10.0 * t1, Y, jnp.asarray(0.1), ARGS, None, 8.0)
+    state = inner, jnp.asarray(retries)
+    return control.adapt_step_size(t0, t1, Y, Y, ARGS, error, 8.0, state)
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_stage_close_to_a_singular_configuration_is_moved_away(controller):
+    keep, next_t0, next_t1, _, (_, retries), _ = adapt(controller, FAR._replace(passes=jnp.asarray(1e-3)))
+    assert not keep
+    assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        FAR,
+        FAR._replace(passes=jnp.asarray(0.02)),
+        FAR._replace(leaves=jnp.asarray(0.0), passes=jnp.asarray(1e-6)),
+        FAR._replace(leaves=jnp.asarray(5e-3), passes=jnp.asarray(1e-3)),
+    ],
+    ids=["far", "far enough", "from a singular configuration", "as far as a step from so close can keep"],
+)
+def test_other_steps_are_kept(error):
+    keep, next_t0, next_t1, *_ = adapt(CONTROLLERS[0], error)
+    assert keep
+    assert next_t0 == 1.0
+    assert next_t1 > 2.0
+
+
+def test_it_gives_up_after_some_tries():
+    near = FAR._replace(passes=jnp.asarray(1e-3))
+    tried = [bool(adapt(CONTROLLERS[0], near, retries=retries)[0]) for retries in range(8)]
+    assert tried == sorted(tried)
+    assert not tried[0]
+    assert tried[-1]
+
+
+def test_fixed_steps_are_left_alone():
+    near, far = (adapt(diffrax.ConstantStepSize(), FAR._replace(passes=jnp.asarray(d))) for d in (1e-3, 1.0))
+    assert near[0]
+    assert near[:3] == far[:3]
+
+
+def test_errors_count_in_the_units_of_the_mechanism_less_rounding():
+    at = lambda q, v: FAR._replace(error=(jnp.asarray(q), jnp.asarray(v)))
+    kept = lambda error: bool(adapt(CONTROLLERS[0], error)[0])
+    # Of two coordinates and two speeds: the root of the mean square counts.
+    assert kept(at([1.5e-8, 0.0], [0.0, 0.0]))
+    assert kept(at([0.0, 1.5e-5], [0.0, 0.0]))
+    assert not kept(at([6e-8, 0.0], [0.0, 0.0]))
+    assert not kept(at([0.0, 6e-5], [0.0, 0.0]))
+    # The tightest of tolerances does not ask for less than rounding.
+    tight = diffrax.PIDController(rtol=1e-30, atol=1e-30)
+    assert bool(adapt(tight, at([2e-16, 2e-13], [8e-16, 8e-13]))[0])
+    assert not bool(adapt(tight, at([1e-14, 0.0], [0.0, 0.0]))[0])
+
+
+def test_rounding_grows_near_a_singular_configuration_up_to_the_rank_tolerance():
+    tight = diffrax.PIDController(rtol=1e-30, atol=1e-30)
+    ends = lambda size, d: FAR._replace(
+        error=(jnp.array([size, 0.0]), jnp.zeros(2)), leaves=jnp.asarray(0.0), passes=jnp.asarray(d)
+    )
+    kept = lambda size, d: bool(adapt(tight, ends(size, d))[0])
+    far = FAR._replace(error=(jnp.array([1e-13, 0.0]), jnp.zeros(2)))
+    assert not bool(adapt(tight, far)[0])
+    assert kept(1e-13, 1e-4)
+    assert kept(2e-10, 1e-9)
+    assert not kept(5e-10, 1e-9)
+
+
+def test_from_a_state_that_is_not_sound_no_step_is_taken(monkeypatch):
+    for controller in (CONTROLLERS[0], diffrax.ConstantStepSize()):
+        *_, result = adapt(controller, FAR)
+        assert result == diffrax.RESULTS.successful
+        monkeypatch.setattr(ARGS, "sound", False)
+        keep, *_, result = adapt(controller, FAR)
+        assert not keep
+        assert result == diffrax.RESULTS.dt_min_reached
+        monkeypatch.undo()
+
+
+def test_under_jit_vmap_and_both_modes():
+    def next_step(size, passes):
+        error = StepError((size * jnp.ones(2), jnp.zeros(2)), jnp.asarray(1.0), passes, jnp.asarray(0.5))
+        keep, _, next_t1, *_ = adapt(CONTROLLERS[0], error)
+        return jnp.where(keep, next_t1, -next_t1)
+
+    sizes, passes = jnp.array([1e-9, 1e-9, 1e-7]), jnp.array([0.5, 1e-3, 0.5])
+    single = [next_step(size, near) for size, near in zip(sizes, passes, strict=True)]
+    np.testing.assert_allclose(jax.jit(jax.vmap(next_step))(sizes, passes), single, rtol=1e-14)
+    for mode in (jax.jacfwd, jax.jacrev):
+        assert np.isfinite(mode(next_step)(1e-9, jnp.asarray(0.5)))
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Kvaerno5()])
+def test_an_event_at_any_node_is_moved_between_nodes(solver):
+    nodes = np.asarray(solver.tableau.c, dtype=float)
+    for node, factor in zip(nodes, placements(nodes), strict=True):
+        assert 0.0 < factor <= 1.0
+        gaps = np.abs(np.array([0.0, *nodes]) - node / factor)
+        assert np.min(gaps) >= 0.02, (node, factor)
