@@ -18,6 +18,8 @@ from linkax.simulation.segments import simulate_in_segments
 PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
 SOLVERS = {name.lower(): getattr(diffrax, name) for name in ("Tsit5", "Dopri5", "Dopri8")}
 INTERVALS = 1000
+SHOWN = 5
+WORTH_TELLING = 0.05  # distance from a singular configuration
 
 
 class _Parser(argparse.ArgumentParser):
@@ -172,7 +174,22 @@ def _for_people(found, files):
         f"  acceleration violation {found['acceleration_violation']:.1e} of the largest acceleration",
         f"  energy error          {found['energy_error']:.1e} of the largest kinetic energy",
         f"  independent loop rows {found['rank_min']} to {found['rank_max']}",
+        *_of_singular_configurations(found),
         *final,
         "written: " + ", ".join(map(str, files)),
     ]
     return "\n".join(lines)
+
+
+def _of_singular_configurations(found):
+    """Lines on singular configurations, where the run came close to one."""
+    lines = []
+    if found["passages"]:
+        count, times = len(found["passages"]), ", ".join(f"{time:.6g}" for time in found["passages"][:SHOWN])
+        more = "" if count <= SHOWN else ", ..."
+        lines.append(f"  singular passages     {count}, at {times}{more} s")
+    elif found["singularity_distance"] < WORTH_TELLING:
+        lines.append(f"  singular configuration as near as {found['singularity_distance']:.1e} (1 is far)")
+    if lines:
+        lines.append(f"  digits lost to that   {found['digits_lost']:.1f} of 16")
+    return lines

@@ -6,21 +6,33 @@ from linkax.simulation.results import RESULTS
 from linkax.simulation.segments import TimedRun
 from linkax.simulation.solution import Solution
 
+KNOWN_RESULTS = (
+    "successful",
+    "max_steps_reached",
+    "dt_min_reached",
+    "event_occurred",
+    "not_closed",
+    "no_branch",
+    "not_unique",
+    "not_finite",
+)
+
 
 def result_name(result) -> str:
     """The name of a result, such as "successful" or "max_steps_reached"."""
-    for name in ("successful", "max_steps_reached", "dt_min_reached", "event_occurred", "not_closed", "not_finite"):
+    for name in KNOWN_RESULTS:
         if bool(result == getattr(RESULTS, name)):
             return name
     return "failed"
 
 
 def summary(run: TimedRun, points) -> dict:
-    """Steps, times, violations, energy error, rank, result and final positions of a run.
+    """Steps, times, violations, energy error, rank, passages, result and final positions of a run.
 
     Violations are relative (`Solution.worst_violation`); `energy_error` is the largest change of
-    the energy over the largest kinetic energy, or in joules where nothing moves. What is not
-    finite is None.
+    the energy over the largest kinetic energy, or in joules where nothing moves. Of singular
+    configurations: the smallest distance at a saved time, the times of passages [s], and the
+    digits that they cost (`Solution.passages`). What is not finite is None.
     """
     solution = run.solution
     reached = np.isfinite(np.asarray(solution.ts))
@@ -28,6 +40,7 @@ def summary(run: TimedRun, points) -> dict:
     energy, kinetic = np.asarray(solution.energy())[reached], np.asarray(solution.kinetic_energy())[reached]
     rank = np.asarray(solution.rank())[reached]
     drift, scale = np.max(np.abs(energy - energy[:1]), initial=0.0), np.max(kinetic, initial=0.0)
+    passed = solution.passages()
     last = np.flatnonzero(reached)[-1] if np.any(reached) else 0
     return {
         "steps": int(solution.stats["num_steps"]),
@@ -40,6 +53,9 @@ def summary(run: TimedRun, points) -> dict:
         "energy_error": _finite(drift / scale if scale > 0.0 else drift),
         "rank_min": int(np.min(rank, initial=rank[0] if len(rank) else 0)),
         "rank_max": int(np.max(rank, initial=0)),
+        "singularity_distance": _finite(np.min(np.asarray(solution.singularity_distance())[reached], initial=1.0)),
+        "passages": [float(time) for time in passed.times],
+        "digits_lost": passed.digits,
         "result": result_name(solution.result),
         "message": "" if result_name(solution.result) == "successful" else str(RESULTS[solution.result]),
         "t_end": _finite(solution.t_end),

@@ -17,6 +17,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.integration import Problem
+from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
 from linkax.simulation.state import State, joint_coordinates
 from linkax.spatial.rotations import cross, rotate
@@ -167,6 +168,15 @@ class Solution(eqx.Module):
     def singularity_distance(self) -> Float[Array, "*batch n_t"]:
         """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
         return _over_times(_distance, self)
+
+    def passages(self) -> Passages:
+        """Times at which the motion goes through singular configurations, and the digits lost.
+
+        Outside of JAX transformations, for one run.
+
+        **Raises:** `ValueError` for a batch, or where functions of one's own were saved.
+        """
+        return passages(self)
 
     def evaluate(self, t) -> State:
         """The state at a time [s] between the steps; needs `saveat=SaveAt(dense=True)`."""
