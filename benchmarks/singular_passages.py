@@ -1,0 +1,174 @@
+"""Runs through singular configurations: errors over tolerances and steps, ways to compute there, cost.
+
+Each table is of this machine, this run; times are ratios. `--part` chooses one of them:
+
+- `tolerances`: scenes x tolerances x solvers; largest error, accepted and rejected steps.
+- `steps`: scenes x fixed steps.
+- `ways`: many random passages, with and without the means that linkax takes.
+- `cost`: a mechanism that never comes near, with and without the clearance.
+- `long`: 10 000 s of the four-bar, about twenty passages every ten seconds.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import diffrax
+import jax
+import numpy as np
+
+import linkax as lx
+from linkax.scenes import SCENES
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from known_answers import n_four_bar, reference
+
+TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12, 1e-13)
+STEPS = (10e-3, 5e-3, 2e-3, 1e-3, 0.5e-3)
+SOLVERS = (diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8())
+MEMBERS = 400
+REPEATS = 15
+
+
+def start(name, variant, changes=None):
+    scene = SCENES[name]
+    settings = scene.settings(variant, changes)
+    mechanism = scene.mechanism(settings)
+    return mechanism, scene.initial(mechanism, settings)
+
+
+def cases():
+    for variant in ("SC1", "SC2", "SC3", "SC4"):
+        known = reference(f"crank_slider_{variant}")["x_slider"]
+        yield variant, start("crank-slider", variant), 5.0, lambda f, known=known: f.position("slider")[:, 0] - known
+    for variant, angle in (("FL1", np.pi / 2), ("FL2", 0.0)):
+        circle = lambda t, angle=angle: np.stack([np.cos(t + angle), np.sin(t + angle)], axis=-1)
+        error = lambda f, circle=circle: f.position("link_0", at="tip")[:, :2] - circle(np.asarray(f.ts))
+        yield variant, start("n-four-bar", variant), 10.0, error
+    for count in (1, 2, 5, 10):
+        error = lambda f, count=count: f.position("link_0", at="tip")[:, :2] - n_four_bar(f.ts, count)
+        yield f"A02 N={count}", start("n-four-bar", "A02", {"N": count}), 10.0, error
+
+
+def tolerances():
+    for name, (mechanism, state), t1, error in cases():
+        for solver in SOLVERS:
+            row = {"scene": name, "solver": type(solver).__name__}
+            for rtol in TOLERANCES:
+                accuracy = lx.Accuracy(rtol=rtol)
+                found = lx.simulate(mechanism, state, t1=t1, accuracy=accuracy, solver=solver, throw=False)
+                accepted, rejected = (int(found.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
+                failed = "" if found.result == lx.RESULTS.successful else " failed"
+                row[f"{rtol:.0e}"] = f"{np.max(np.abs(error(found))):.1e} ({accepted}+{rejected}){failed}"
+            yield row
+
+
+def steps():
+    for name, (mechanism, state), _, error in cases():
+        if name not in ("SC2", "FL1"):
+            continue
+        for solver in SOLVERS:
+            row = {"scene": name, "solver": type(solver).__name__}
+            for step in STEPS:
+                fixed = diffrax.ConstantStepSize()
+                found = lx.simulate(mechanism, state, t1=5.0, dt0=step, solver=solver, stepsize_controller=fixed)
+                t = np.asarray(found.ts)
+                assert np.all(np.isfinite(t))
+                row[f"{1e3 * step:g} ms"] = f"{np.max(np.abs(error(found))):.1e}"
+            yield row
+
+
+def ways():
+    """Errors against the tightest run with all means, over random phases of the passage."""
+    mechanism, _ = start("crank-slider", "SC2")
+    angles = np.random.default_rng(0).uniform(0.0, np.pi / 2, MEMBERS)
+    speeds = np.sqrt(2.0 / (2.0 / 3.0 + 6.0 * np.sin(angles) ** 2))
+    coordinates = {"bearing": angles, "crank_pin": -2.0 * angles, "guide": 2.0 * np.cos(angles)}
+    rates = {"bearing": speeds, "crank_pin": -2.0 * speeds, "guide": -2.0 * np.sin(angles) * speeds}
+    q, v = (np.stack([of[name] for name in mechanism.topology.coordinates], axis=1) for of in (coordinates, rates))
+
+    def run(accuracy):
+        one = lambda q, v, accuracy: lx.simulate(
+            mechanism, lx.State(q, v), t1=2.0, accuracy=accuracy, saveat=diffrax.SaveAt(t1=True), throw=False
+        ).q[0]
+        return np.asarray(jax.vmap(one, (0, 0, None))(q, v, accuracy))
+
+    exact = run(lx.Accuracy(rtol=1e-14))
+    for clearance, projection in ((1e-2, "both"), (1e-3, "both"), (0.0, "both"), (1e-2, "stage"), (0.0, "stage")):
+        row = {"clearance": clearance, "projection": projection}
+        for rtol in TOLERANCES:
+            errors = np.max(np.abs(run(lx.Accuracy(rtol=rtol, clearance=clearance, projection=projection)) - exact), 1)
+            failed = int(np.sum(~np.isfinite(errors)))
+            row[f"{rtol:.0e}"] = f"{np.nanmedian(errors):.0e} ... {np.nanmax(errors):.0e}" + f" ({failed} failed)" * (
+                failed > 0
+            )
+        yield row
+
+
+def cost():
+    """Interleaved runs, so that both meet the same noise; the ratio of the fastest, and of medians."""
+    mechanism, state = start("crank-slider", "regular")
+
+    def run(clearance):
+        began = time.perf_counter()
+        found = lx.simulate(mechanism, state, t1=3.0, accuracy=lx.Accuracy(rtol=1e-10, clearance=clearance))
+        jax.block_until_ready(found.q)
+        return time.perf_counter() - began, int(found.stats["num_steps"])
+
+    run(0.0)
+    times = {0.0: [], 1e-2: []}
+    for _ in range(REPEATS):
+        for clearance, kept in times.items():
+            kept.append(run(clearance)[0])
+    without, with_it = (np.array(kept) for kept in times.values())
+    yield {
+        "steps without": run(0.0)[1],
+        "steps with": run(1e-2)[1],
+        "time, fastest": f"{np.min(with_it) / np.min(without):.3f}",
+        "time, median": f"{np.median(with_it) / np.median(without):.3f}",
+    }
+
+
+def long():
+    mechanism, state = start("n-four-bar", "A02", {"N": 1})
+    began = time.perf_counter()
+    found = lx.simulate(mechanism, state, t1=1e4, max_steps=10**6)
+    seconds = time.perf_counter() - began
+    apart = np.max(np.abs(found.joint("pivot_0") - found.joint("pivot_1")))
+    energy = np.asarray(found.energy())
+    violation = found.worst_violation()
+    yield {
+        "steps": int(found.stats["num_steps"]),
+        "links apart [rad]": f"{apart:.1e}",
+        **{f"{level} violation": f"{float(size):.1e}" for level, size in violation._asdict().items()},
+        "energy drift": f"{np.max(np.abs(energy - energy[0])) / np.max(np.asarray(found.kinetic_energy())):.1e}",
+        "seconds": f"{seconds:.0f}",
+    }
+
+
+PARTS = {part.__name__: part for part in (tolerances, steps, ways, cost, long)}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", choices=PARTS, action="append", help="default: all")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    found = {}
+    for name in arguments.part or PARTS:
+        found[name] = []
+        if not arguments.json:
+            print(f"\n{name}")
+        for row in PARTS[name]():
+            found[name].append(row)
+            if not arguments.json:
+                print("  " + "  ".join(f"{key} {entry}" for key, entry in row.items()), flush=True)
+    if arguments.json:
+        print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
