@@ -1,0 +1,26 @@
+"""Every notebook runs from its first cell to its last, and keeps its outputs."""
+
+import json
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(path, monkeypatch, capsys):
+    matplotlib.use("agg")
+    shown = []
+    monkeypatch.setattr("matplotlib.pyplot.show", lambda: shown.append(matplotlib.pyplot.gcf()))
+    cells = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+    names = {"__name__": "__main__"}
+    for count, cell in enumerate(cells, start=1):
+        exec(compile("".join(cell["source"]), f"{path.name}, code cell {count}", "exec"), names)
+        kept = [kind for output in cell["outputs"] for kind in output.get("data", {})]
+        assert kept.count("image/png") == len(shown), f"code cell {count}: outputs kept"
+        printed = "".join("".join(output["text"]) for output in cell["outputs"] if output["output_type"] == "stream")
+        assert len(capsys.readouterr().out.splitlines()) == len(printed.splitlines()), f"code cell {count}: outputs kept"
+        shown.clear()
+    matplotlib.pyplot.close("all")
