@@ -20,24 +20,16 @@ import jax
 import numpy as np
 
 import linkax as lx
-from linkax.scenes import SCENES
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from known_answers import n_four_bar, reference
+from known_answers import n_four_bar, reference, start
 
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12, 1e-13)
 STEPS = (10e-3, 5e-3, 2e-3, 1e-3, 0.5e-3)
 SOLVERS = (diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8())
 MEMBERS = 400
 REPEATS = 15
-
-
-def start(name, variant, changes=None):
-    scene = SCENES[name]
-    settings = scene.settings(variant, changes)
-    mechanism = scene.mechanism(settings)
-    return mechanism, scene.initial(mechanism, settings)
 
 
 def cases():

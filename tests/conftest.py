@@ -1,5 +1,9 @@
+import os
 import sys
 from pathlib import Path
+
+# Tests spend their time on compiling, which these halve; they change how code is made, not what it computes.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true")
 
 import jax
 import pytest

@@ -5,10 +5,20 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ellipj, ellipk
 
+from linkax.scenes import SCENES
+
 
 def reference(name):
     """A file of `data` as a record array."""
     return np.genfromtxt(Path(__file__).parent / "data" / f"{name}.csv", delimiter=",", names=True)
+
+
+def start(name, variant=None, changes=None):
+    """Mechanism and initial state of a scene."""
+    scene = SCENES[name]
+    settings = scene.settings(variant, changes)
+    mechanism = scene.mechanism(settings)
+    return mechanism, scene.initial(mechanism, settings)
 
 
 def n_four_bar(times, count, gravity=9.81):

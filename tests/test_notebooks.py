@@ -21,6 +21,8 @@ def test_a_notebook_runs(path, monkeypatch, capsys):
         kept = [kind for output in cell["outputs"] for kind in output.get("data", {})]
         assert kept.count("image/png") == len(shown), f"code cell {count}: outputs kept"
         printed = "".join("".join(output["text"]) for output in cell["outputs"] if output["output_type"] == "stream")
-        assert len(capsys.readouterr().out.splitlines()) == len(printed.splitlines()), f"code cell {count}: outputs kept"
+        assert len(capsys.readouterr().out.splitlines()) == len(printed.splitlines()), (
+            f"code cell {count}: outputs kept"
+        )
         shown.clear()
     matplotlib.pyplot.close("all")

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from known_answers import n_four_bar, reference
+from known_answers import n_four_bar, reference, start
 
 import linkax as lx
 from linkax.scenes import SCENES
@@ -14,10 +14,7 @@ RUNS = [(name, variant) for name, scene in SCENES.items() for variant in scene.v
 
 
 def run(name, variant=None, changes=None, *, t1, accuracy=lx.PRECISE):
-    scene = SCENES[name]
-    settings = scene.settings(variant, changes)
-    mechanism = scene.mechanism(settings)
-    return lx.simulate(mechanism, scene.initial(mechanism, settings), t1=t1, accuracy=accuracy)
+    return lx.simulate(*start(name, variant, changes), t1=t1, accuracy=accuracy)
 
 
 @pytest.mark.parametrize(("variant", "bound"), [("SC1", 1e-9), ("SC2", 1e-9), ("SC3", 5e-9), ("SC4", 1e-9)])

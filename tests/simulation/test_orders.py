@@ -3,9 +3,9 @@
 import diffrax
 import numpy as np
 import pytest
+from known_answers import start
 
 import linkax as lx
-from linkax.scenes import SCENES
 
 # Solver, its order, and numbers of steps between rounding and where the order sets in.
 SOLVERS = [
@@ -20,10 +20,7 @@ RUNS = {"crank-slider": ("regular", 0.4), "pendulum": ("A01", 2.0)}
 @pytest.mark.parametrize(("solver", "order", "counts"), SOLVERS, ids=["Tsit5", "Dopri5", "Dopri8"])
 def test_order(name, solver, order, counts):
     variant, t1 = RUNS[name]
-    scene = SCENES[name]
-    settings = scene.settings(variant)
-    mechanism = scene.mechanism(settings)
-    state = scene.initial(mechanism, settings)
+    mechanism, state = start(name, variant)
     # Saved at ends of steps, so that the interpolation between them has no part in it.
     saveat = diffrax.SaveAt(ts=np.linspace(0.0, t1, 5))
     exact = lx.simulate(mechanism, state, t1=t1, accuracy=lx.Accuracy(rtol=1e-13), saveat=saveat)

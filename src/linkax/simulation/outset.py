@@ -55,16 +55,14 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     crossing, acceleration = method.departure(system, t, q)
     gap = gaps(crossing.cuts)
     small = jnp.sqrt(jnp.finfo(system.dtype).eps)
-    # Rows that are not quite dependent contradict each other by as much.
-    slight = ON_BRANCH * method.rank_tolerance
     size = lambda speeds: jnp.max(jnp.abs(speeds / system.coordinate_units), initial=0.0)
     at_rest = size(v) ** 2 <= jnp.finfo(system.dtype).eps * size(acceleration)
-    direction = jnp.where(at_rest, acceleration, v)
-    off = jnp.max(jnp.abs(crossing.off_branch(direction)), initial=0.0)
-    on_branch = off <= slight * size(direction) ** 2
+    off, rank = crossing.along(jnp.where(at_rest, acceleration, v))
+    # Rows that are not quite dependent contradict each other by as much.
+    on_branch = jnp.max(jnp.abs(off), initial=0.0) <= ON_BRANCH * method.rank_tolerance
     return Outset(
         state=start,
-        rank=crossing.rank_along(direction),
+        rank=rank,
         finite=finite,
         closed=jnp.all(gap.distance <= small * system.length) & jnp.all(gap.angle <= small),
         on_branch=on_branch | at_rest,

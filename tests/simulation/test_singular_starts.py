@@ -1,0 +1,142 @@
+"""Starts in singular configurations, next to them, and anywhere."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from known_answers import start
+from scipy.optimize import brentq
+from scipy.special import ellipeinc
+
+import linkax as lx
+
+
+class FreeCrankSlider:
+    """Crank-slider of equal lengths and masses without gravity, where the energy integral gives time.
+
+    ½ J(θ) θ̇² with J = 2/3 + 6 sin²θ stays one, so that t is an elliptic integral of θ.
+    """
+
+    duration = 2.0
+
+    def __init__(self, angles, directions):
+        self.angles, self.speeds = angles, directions * np.sqrt(2.0 / (2.0 / 3.0 + 6.0 * np.sin(angles) ** 2))
+        mechanism, _ = start("crank-slider", "SC2")
+        coordinates = {"bearing": angles, "crank_pin": -2.0 * angles, "guide": 2.0 * np.cos(angles)}
+        rates = {
+            "bearing": self.speeds,
+            "crank_pin": -2.0 * self.speeds,
+            "guide": -2.0 * np.sin(angles) * self.speeds,
+        }
+        names = list(mechanism.topology.coordinates)
+        self.mechanism = mechanism
+        self.q = np.stack([coordinates[name] for name in names], axis=1)
+        self.v = np.stack([rates[name] for name in names], axis=1)
+
+    def run(self, q, v, accuracy):
+        saveat = diffrax.SaveAt(ts=np.array([self.duration]))
+        state, t1 = lx.State(q, v), self.duration
+        return lx.simulate(self.mechanism, state, t1=t1, accuracy=accuracy, saveat=saveat, throw=False)
+
+    def batch(self, rtol):
+        return jax.vmap(self.run, (0, 0, None))(self.q, self.v, lx.Accuracy(rtol=rtol))
+
+    def exact(self):
+        time = lambda angle: np.sqrt(1.0 / 3.0) * ellipeinc(angle, -9.0)
+        ends = zip(self.angles, np.sign(self.speeds) * self.duration, strict=True)
+        find = lambda a, t: brentq(lambda angle: time(angle) - time(a) - t, a - 8.0, a + 8.0, xtol=1e-15, rtol=1e-15)
+        return np.array([find(angle, elapsed) for angle, elapsed in ends])
+
+
+MEMBERS = 1000
+
+
+def next_to_the_singular_configuration():
+    generator = np.random.default_rng(0)
+    distances = 10.0 ** generator.uniform(-14.0, -1.0, MEMBERS) * generator.choice([-1.0, 1.0], MEMBERS)
+    return FreeCrankSlider(np.pi / 2 + distances, generator.choice([-1.0, 1.0], MEMBERS))
+
+
+def anywhere():
+    generator = np.random.default_rng(1)
+    return FreeCrankSlider(generator.uniform(0.0, np.pi / 2, MEMBERS), np.ones(MEMBERS))
+
+
+@pytest.mark.parametrize("starts", [next_to_the_singular_configuration, anywhere])
+def test_errors_of_many_starts_lie_on_one_curve(starts):
+    starts = starts()
+    exact = starts.exact()
+    for rtol in (1e-6, 1e-8, 1e-10, 1e-12, 1e-13):
+        found = starts.batch(rtol)
+        assert np.all(found.result == lx.RESULTS.successful)
+        tip, slider = found.position("crank", at="tip")[:, 0], found.position("slider")[:, 0]
+        expected = np.stack([np.cos(exact), np.sin(exact)], axis=1)
+        assert np.max(np.abs(slider[:, 0] - 2.0 * expected[:, 0])) <= 10.0 * rtol + 1e-11
+        assert np.max(np.abs(tip[:, :2] - expected)) <= 5.0 * rtol + 1e-11
+
+
+def test_members_of_a_batch_equal_single_runs():
+    starts = anywhere()
+    together = starts.batch(1e-12)
+    alone = [starts.run(q, v, lx.PRECISE).q for q, v in zip(starts.q, starts.v, strict=True)]
+    assert np.max(np.abs(together.q - np.stack(alone))) <= 1e-10
+
+
+# The crank-slider with crank and rod on each other: the slider stands still, or moves.
+UPRIGHT = {"bearing": np.pi / 2, "guide": 0.0}
+
+
+def upright(speeds):
+    mechanism, _ = start("crank-slider", "SC1")
+    return mechanism, lx.assemble(mechanism, UPRIGHT, speeds, guess={"crank_pin": -np.pi})
+
+
+@pytest.mark.parametrize(
+    ("speeds", "slider_speed"),
+    [({"bearing": 1.0}, 0.0), ({"guide": -2.0}, -2.0), ({"bearing": 1.0, "crank_pin": -2.0}, -2.0)],
+)
+def test_speeds_are_completed_on_a_branch(speeds, slider_speed):
+    mechanism, state = upright(speeds)
+    found = lx.simulate(mechanism, state, t1=0.5, accuracy=lx.PRECISE)
+    np.testing.assert_allclose(found.joint_speed("guide")[0], slider_speed, atol=1e-12)
+    slider, tip = found.position("slider")[:, 0], found.position("crank", at="tip")[:, 0]
+    np.testing.assert_allclose(slider, 2.0 * tip if slider_speed else 0.0 * tip, atol=1e-11)
+
+
+def test_speeds_on_no_branch_are_found_out():
+    with pytest.raises(lx.AssemblyError, match=r"lie on no branch.*'bearing', 'guide', 'crank_pin', 'wrist_pin'"):
+        upright({"bearing": 1.0, "guide": -1.0})
+    mechanism, state = upright({"guide": -2.0})
+    between = lx.State(state.q, state.v * jnp.array([1.0, 0.5, 0.5]))
+    with pytest.raises(lx.SimulationError, match=r"before it began.*no branch.*'guide'") as failure:
+        lx.simulate(mechanism, between, t1=0.5)
+    assert failure.value.solution.result == lx.RESULTS.no_branch
+
+
+def test_a_start_at_rest_that_is_not_unique_is_found_out():
+    mechanism, state = upright({})
+    with pytest.raises(lx.SimulationError, match=r"at rest in a singular.*not unique.*'bearing'") as failure:
+        lx.simulate(mechanism, state, t1=0.5)
+    assert failure.value.solution.result == lx.RESULTS.not_unique
+    # Without forces it stays, and that is unique.
+    mechanism, _ = start("crank-slider", "SC2")
+    assert np.ptp(lx.simulate(mechanism, state, t1=0.5).q, axis=0) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_in_a_batch_a_start_without_branch_harms_no_other():
+    starts = anywhere()
+    undisturbed = starts.batch(1e-8)
+    _, state = upright({"guide": -2.0})
+    starts.q[7], starts.v[7] = state.q, state.v * np.array([1.0, 0.5, 0.5])
+    starts.v[8] = np.nan
+    found = starts.batch(1e-8)
+    assert np.flatnonzero(found.result == lx.RESULTS.no_branch).tolist() == [7]
+    assert np.flatnonzero(found.result == lx.RESULTS.not_finite).tolist() == [8]
+    assert found.stats["num_steps"][7:9].tolist() == [1, 1]
+    others = np.flatnonzero(found.result == lx.RESULTS.successful)
+    assert len(others) == MEMBERS - 2
+    # Not to the last digit, as diffrax takes up no stage of a step's predecessor while a member lacks it.
+    np.testing.assert_allclose(found.q[others], undisturbed.q[others], atol=1e-9)
+    with pytest.raises(ValueError, match="passages of a batch"):
+        found.passages()
