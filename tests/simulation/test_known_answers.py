@@ -50,17 +50,6 @@ def test_pendulum_at_ten_seconds():
     assert np.hypot(bob[0] - known["x"][20], bob[1] - known["y"][20]) <= 1e-9
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 10])
-def test_row_of_four_bars_stays_on_its_branch(count):
-    found = run("n-four-bar", changes={"N": count}, t1=10.0)
-    error = found.position("link_0", at="tip")[-1, :2] - n_four_bar(10.0, count)
-    assert np.linalg.norm(error) <= 1e-8
-    angles = np.stack([found.joint(f"pivot_{i}") for i in range(count + 1)])
-    assert np.max(np.abs(angles - angles[0])) <= 1e-9
-    # The rank drops to count where the links lie in line, at no saved time here.
-    assert np.all(found.rank() == 2 * count)
-
-
 def test_closed_form_agrees_with_the_tables():
     for count in (1, 2):
         known = reference(f"A02_nfourbar_N{count}")

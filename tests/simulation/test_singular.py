@@ -60,6 +60,17 @@ def test_tighter_tolerances_are_never_worse(solver, name):
         assert steps[3] <= 3 * steps[2]
 
 
+@pytest.mark.parametrize("count", [1, 2, 5, 10])
+def test_row_of_four_bars_stays_on_its_branch(count):
+    found = lx.simulate(*start("n-four-bar", "A02", {"N": count}), t1=10.0, accuracy=lx.PRECISE)
+    error = found.position("link_0", at="tip")[-1, :2] - n_four_bar(10.0, count)
+    assert np.linalg.norm(error) <= 1e-8
+    angles = np.stack([found.joint(f"pivot_{i}") for i in range(count + 1)])
+    assert np.max(np.abs(angles - angles[0])) <= 1e-9
+    # The rank drops to count where the links lie in line, at no saved time here.
+    assert np.all(found.rank() == 2 * count)
+
+
 class RK4(diffrax.AbstractERK):
     """The classical method, without an error estimate."""
 
