@@ -6,7 +6,7 @@ Each table is of this machine, this run; times are ratios. `--part` chooses one 
 - `steps`: scenes x fixed steps.
 - `phases`: many passages at random phases of the steps, over the clearance; median and largest error.
 - `cost`: a mechanism that never comes near, with and without the clearance.
-- `long`: 10 000 s of the four-bar, about twenty passages every ten seconds.
+- `long`: 10 000 s of the four-bar, about one passage a second.
 """
 
 import argparse

@@ -110,7 +110,7 @@ def test_a_motion_far_from_singular_is_the_same_without_the_clearance():
 
 
 def test_a_long_run_stays_on_its_branch():
-    """More than a thousand passages; 10 000 s are in benchmarks/singular_passages.py."""
+    """About a thousand passages; 10 000 s are in benchmarks/singular_passages.py."""
     mechanism, state = start("n-four-bar", "A02", {"N": 1})
     found = lx.simulate(mechanism, state, t1=1000.0)
     angles = np.stack([found.joint(f"pivot_{i}") for i in range(2)])
