@@ -1,5 +1,7 @@
 """A pool of mechanisms for laws that hold for all of them."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import linkax as lx
@@ -20,40 +22,127 @@ def crank_slider(cut=None, order=1, offset=(0.0, 0.0, 0.0), rod=1.3):
     return lx.Mechanism([crank, link, slider], joints[::order], [lx.Gravity([0.0, -9.81, 0.0])])
 
 
-def rotation(generator):
-    q, _ = np.linalg.qr(generator.normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
+class Numbers:
+    """Random numbers for a mechanism, all of them traced: axes and rotations too."""
 
+    def __init__(self, seed):
+        self.generator = np.random.default_rng(seed)
 
-def spatial(seed):
-    """Bodies of any shape in loops of revolute, prismatic and fixed joints, in frames of any
-    rotation, some joints declared against the tree's direction and some from ground's side."""
-    generator = np.random.default_rng(seed)
+    def vector(self, size=3):
+        return jnp.array(self.generator.normal(size=size))
 
-    def body(name):
-        root = generator.normal(size=(3, 3))
+    def positive(self):
+        return 0.5 + self.generator.random()
+
+    def body(self, name):
+        root = self.generator.normal(size=(3, 3))
         inertia = np.trace(root @ root.T) * np.eye(3) - root @ root.T
-        return lx.RigidBody(name, 1.0 + generator.random(), generator.normal(size=3), inertia)
+        return lx.RigidBody(name, self.positive(), self.vector(), inertia)
 
-    bodies = [body(f"body_{i}") for i in range(5)]
-    frame = lambda place: place.at(generator.normal(size=3), rotation(generator))
-    axis = lambda: generator.normal(size=3)
+    def frame(self, place):
+        q, _ = np.linalg.qr(self.generator.normal(size=(3, 3)))
+        return place.at(self.vector(), jnp.array(q * np.sign(np.linalg.det(q))))
+
+    def joint(self, kind, name, parent, child, **options):
+        """A joint of any type between frames of any rotation."""
+        if kind in (lx.Revolute, lx.Prismatic, lx.Cylindrical, lx.Planar, lx.Universal, lx.Screw):
+            options["axis"] = self.vector()
+        if kind is lx.Screw:
+            options["pitch"] = self.positive()
+        if kind is lx.Distance:
+            options["length"] = self.positive()
+        return kind(name, self.frame(parent), self.frame(child), **options)
+
+
+GRAVITY = lx.Gravity([0.3, -9.81, 1.0])
+KINDS = (
+    lx.Revolute,
+    lx.Universal,
+    lx.Spherical,
+    lx.Prismatic,
+    lx.Cylindrical,
+    lx.Fixed,
+    lx.Planar,
+    lx.Free,
+    lx.Screw,
+    lx.Distance,
+)
+
+
+def both_roles(kind, seed):
+    """A joint type in the tree, against its direction and along it, and cut, to ground and between bodies."""
+    numbers = Numbers(seed)
+    a, b, c = (numbers.body(f"body_{i}") for i in range(3))
+    carrying = kind if kind is not lx.Distance else lx.Spherical
+    cut = {} if kind is lx.Distance else {"cut": True}
     joints = [
-        lx.Revolute("to_ground", frame(bodies[0]), frame(lx.GROUND), axis()),
-        lx.Prismatic("slide", frame(bodies[1]), frame(bodies[0]), axis()),
-        lx.Revolute("forward", frame(bodies[1]), frame(bodies[2]), axis()),
-        lx.Fixed("weld", frame(bodies[4]), frame(bodies[2])),
-        lx.Revolute("backward", frame(bodies[3]), frame(bodies[2]), axis()),
-        lx.Prismatic("closing_slide", frame(bodies[3]), frame(bodies[0]), axis(), cut=True),
-        lx.Revolute("closing_hinge", frame(bodies[4]), frame(lx.GROUND), axis(), cut=True),
+        numbers.joint(carrying, "backward", a, lx.GROUND),
+        numbers.joint(carrying, "forward", a, b),
+        numbers.joint(lx.Revolute, "branch", lx.GROUND, c),
+        numbers.joint(kind, "closing", b, c, **cut),
+        numbers.joint(kind, "to_ground", lx.GROUND, b, **cut),
     ]
-    return lx.Mechanism(bodies, joints, [lx.Gravity([0.3, -9.81, 1.0])])
+    forces = [
+        GRAVITY,
+        lx.Spring(a.at([0.1, 0.2, 0.3]), c, 3.0, 0.4),
+        lx.Damper(lx.GROUND.at([0.1, 0.2, 0.3]), b, 0.5),
+        lx.JointDamper("branch", 0.7),
+        lx.PointForce(b.at([0.3, 0.1, 0.0]), [1.0, 2.0, 3.0], axes="frame"),
+    ]
+    if joints[3].speed_units:
+        forces.append(lx.JointTorque(("closing", len(joints[3].speed_units) - 1), 1.5))
+    return lx.Mechanism([a, b, c], joints, forces)
+
+
+def floating(seed):
+    """A loop of four unlike joints that touches nothing, under forces of its own."""
+    numbers = Numbers(seed)
+    bodies = [numbers.body(f"body_{i}") for i in range(4)]
+    kinds = (lx.Universal, lx.Spherical, lx.Cylindrical, lx.Revolute)
+    around = zip(kinds, bodies, [*bodies[1:], bodies[0]], strict=True)
+    joints = [numbers.joint(kind, f"joint_{i}", *ends) for i, (kind, *ends) in enumerate(around)]
+    joints.append(lx.Free("afloat", lx.GROUND, bodies[0]))
+    forces = [lx.JointSpring("joint_3", 2.0), lx.Spring(bodies[0], bodies[2], 3.0), lx.JointDamper(("joint_1", 0), 1.0)]
+    return lx.Mechanism(bodies, joints, forces)
+
+
+def _wave(numbers, t):
+    return numbers * jnp.sin(t)
+
+
+def driven(seed):
+    """A drive and a coupling in loops that share joints, under all forces along joints."""
+    numbers = Numbers(seed)
+    a, b, c, d = (numbers.body(f"body_{i}") for i in range(4))
+    joints = [
+        numbers.joint(lx.Revolute, "motor", lx.GROUND, a),
+        numbers.joint(lx.Cylindrical, "sleeve", a, b),
+        numbers.joint(lx.Prismatic, "slide", c, b),
+        numbers.joint(lx.Planar, "table", lx.GROUND, d),
+        numbers.joint(lx.Spherical, "ball", c, d, cut=True),
+        numbers.joint(lx.Universal, "cardan", c, lx.GROUND, cut=True),
+    ]
+    constraints = [
+        lx.Drive("drive", "motor", jax.tree_util.Partial(_wave, numbers.positive())),
+        lx.Coupling("rope", {"slide": 2.0, ("sleeve", 1): -1.0, ("table", 2): 0.5}, offset=numbers.positive()),
+    ]
+    forces = [
+        GRAVITY,
+        lx.JointSpring(("sleeve", 0), 2.0, 0.1),
+        lx.JointTorque(("cardan", 1), 1.3),
+        lx.JointFriction("slide", 1.0, 0.2),
+        lx.JointTorque(("table", 0), jax.tree_util.Partial(_restoring, 0.4)),
+    ]
+    return lx.Mechanism([a, b, c, d], joints, forces, constraints)
+
+
+def _restoring(factor, t, motion):
+    return -factor * motion.joint("table")[0] * jnp.cos(t) + motion.joint_speed("slide")
 
 
 POOL = {
-    "crank-slider": crank_slider(),
-    "crank-slider, guide cut": crank_slider(cut="guide"),
-    "crank-slider, bearing cut": crank_slider(cut="bearing", order=-1),
-    "spatial, seed 0": spatial(0),
-    "spatial, seed 1": spatial(1),
+    "planar": lambda seed: crank_slider(rod=1.0 + Numbers(seed).positive()),
+    **{kind.__name__: lambda seed, kind=kind: both_roles(kind, seed) for kind in KINDS},
+    "floating": floating,
+    "driven": driven,
 }

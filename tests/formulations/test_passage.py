@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linkax.formulations.passage import NEAR, Value, limit
+from linkax.formulations.passage import NEAR, Course, Value, limit
 
 UNITS = jnp.ones(2)
 
@@ -17,15 +17,15 @@ def value(noise, kink, gap, q):
     return Value((q, smooth + spoiled + kink * jnp.abs(q[0])), jnp.abs(q[0]), jnp.asarray(gap))
 
 
-def spoiled(arguments, q):
+def spoiled(arguments, t, q):
     return value(arguments, 0.0, 0.0, q)
 
 
-def kinked(arguments, q):
+def kinked(arguments, t, q):
     return value(arguments, 1.0, 0.0, q)
 
 
-def open_between(arguments, q):
+def open_between(arguments, t, q):
     return value(arguments, 0.0, 1e-9, q)
 
 
@@ -34,23 +34,24 @@ V = jnp.array([2.0, 1.0])
 
 
 def answer(function, noise, q):
-    return limit(function, (0, 1), noise, q, V, UNITS)[0][1]
+    course = Course(jnp.zeros(()), q, V, UNITS, jnp.add, advances=False)
+    return limit(function, (0, 1), noise, course)[0][1]
 
 
 def test_noise_is_left_out():
     np.testing.assert_allclose(answer(spoiled, 1e6, AT), answer(spoiled, 0.0, AT), atol=1e-12)
     away = jnp.array([2.0 * NEAR, 0.3])
-    np.testing.assert_array_equal(answer(spoiled, 1e6, away), spoiled(1e6, away).answers[1])
+    np.testing.assert_array_equal(answer(spoiled, 1e6, away), spoiled(1e6, 0.0, away).answers[1])
 
 
 @pytest.mark.parametrize("function", [kinked, open_between])
 def test_where_there_is_no_limit_the_value_itself_stands(function):
-    np.testing.assert_array_equal(answer(function, 0.25, AT), function(0.25, AT).answers[1])
+    np.testing.assert_array_equal(answer(function, 0.25, AT), function(0.25, 0.0, AT).answers[1])
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_are_those_of_the_limit(mode):
-    exact = jax.jacfwd(lambda q: spoiled(0.0, q).answers[1])(AT)
+    exact = jax.jacfwd(lambda q: spoiled(0.0, 0.0, q).answers[1])(AT)
     np.testing.assert_allclose(mode(lambda q: answer(spoiled, 1e6, q))(AT), exact, atol=1e-10)
 
 

@@ -49,6 +49,21 @@ BAD = {
     "joint with a name": (lambda: lx.Revolute("pin", "part", body(), "z"), ["'pin'", "'part'", "body.at"]),
     "joint without a name": (lambda: lx.Revolute("", lx.GROUND, body(), "z"), ["''", "non-empty"]),
     "gravity of wrong shape": (lambda: lx.Gravity(9.81), ["Gravity", "()", "(3,)"]),
+    "second axis not at a right angle": (
+        lambda: lx.Universal("cross", lx.GROUND, body(), "x", second_axis=[1, 1, 0]),
+        ["'cross'", "second_axis", "45 degrees", "right angle"],
+    ),
+    "screw without a pitch": (lambda: lx.Screw("nut", lx.GROUND, body(), "x", 0.0), ["'nut'", "0.0", "lx.Revolute"]),
+    "distance of zero": (lambda: lx.Distance("rope", lx.GROUND, body(), 0.0), ["'rope'", "0.0", "lx.Spherical"]),
+    "coupling of nothing": (lambda: lx.Coupling("gears", {}), ["'gears'", "{}", "factor"]),
+    "coupling by zero": (lambda: lx.Coupling("gears", {"pin": 0.0}), ["'gears'", "0.0", "not zero"]),
+    "coupling of a number": (lambda: lx.Coupling("gears", {3: 1.0}), ["'gears'", "3", "name of a joint"]),
+    "drive by a number": (lambda: lx.Drive("motor", "pin", 2.0), ["'motor'", "2.0", "function of time"]),
+    "drive by a vector": (lambda: lx.Drive("motor", "pin", lambda t: t * jnp.ones(2)), ["'motor'", "(2,)", "single"]),
+    "spring on one body": (lambda: lx.Spring(body().at([1, 0, 0]), body(), 1.0), ["Spring", "'part'", "two bodies"]),
+    "spring of negative length": (lambda: lx.Spring(lx.GROUND, body(), 1.0, -1.0), ["Spring", "'part'", "-1.0"]),
+    "friction without a scale": (lambda: lx.JointFriction("pin", 1.0, 0.0), ["'pin'", "scale", "positive"]),
+    "force in unknown axes": (lambda: lx.PointForce(body(), [1, 0, 0], "body"), ["'part'", "'body'", "'frame'"]),
     "torque that is not finite": (lambda: lx.JointTorque("pin", np.inf), ["'pin'", "inf", "finite"]),
 }
 
@@ -75,13 +90,20 @@ SPREAD = {
     "cut joint that closes no loop": ([LINK, OTHER], [PIN, CUT_KNEE], [], ["'knee'", "cut=True", "remove"]),
     "no body": ([LINK, "other"], [PIN], [], ["bodies", "'other'", "RigidBody"]),
     "torque on an unknown joint": ([LINK], [PIN], [lx.JointTorque("nip", 1.0)], ["'nip'", "JointTorque", "'pin'"]),
-    "torque on a weld": ([OTHER], [WELD], [lx.JointTorque("weld", 1.0)], ["'weld'", "0 coordinates", "not one"]),
-    "torque on a cut joint": (
-        [LINK, OTHER],
-        [PIN, CUT_KNEE, WELD],
-        [lx.JointTorque("knee", 1.0)],
-        ["'knee'", "is cut", "remove cut=True"],
+    "torque on a weld": ([OTHER], [WELD], [lx.JointTorque("weld", 1.0)], ["'weld'", "0 speeds", "not one"]),
+    "speed that a joint does not have": (
+        [LINK],
+        [lx.Spherical("ball", lx.GROUND, LINK)],
+        [lx.JointDamper(("ball", 3), 1.0)],
+        ["'ball'", "JointDamper", "speed 3", "has 3"],
     ),
+    "spring along a quaternion": (
+        [LINK],
+        [lx.Spherical("ball", lx.GROUND, LINK)],
+        [lx.JointSpring(("ball", 0), 1.0)],
+        ["'ball'", "JointSpring", "quaternion", "another"],
+    ),
+    "spring to a body that is not there": ([LINK], [PIN], [lx.Spring(LINK, OTHER, 1.0)], ["Spring", "'other'", "add"]),
 }
 
 
@@ -113,6 +135,26 @@ def mechanism(length, mass=1.0):
         ],
         [lx.Gravity([0.0, -9.81, 0.0])],
     )
+
+
+RELATED = {
+    "coupling with an unknown joint": (lx.Coupling("gears", {"pin": 1.0, "nip": 2.0}), ["'gears'", "'nip'", "'pin'"]),
+    "coupling with a cut joint": (lx.Coupling("gears", {"far": 1.0}), ["'gears'", "'far'", "is cut", "cut=True"]),
+    "drive of a ball": (lx.Drive("motor", "ball", jnp.sin), ["'motor'", "'ball'", "3 speeds"]),
+    "drive of a turning ball": (lx.Drive("motor", ("ball", 1), jnp.sin), ["'motor'", "'ball'", "quaternion"]),
+    "name taken by a joint": (lx.Distance("pin", lx.GROUND, LINK, 1.0), ["'pin'", "2 times", "of its own"]),
+    "no constraint": (lx.Gravity([0, 0, 1]), ["constraints", "Gravity", "Coupling"]),
+}
+
+
+@pytest.mark.parametrize("case", RELATED)
+def test_bad_constraint(case):
+    constraint, words = RELATED[case]
+    joints = [PIN, lx.Revolute("far", lx.GROUND, LINK.at("tip"), "z", cut=True), lx.Spherical("ball", LINK, OTHER)]
+    with pytest.raises(ValueError, match=r".") as error:
+        lx.Mechanism([LINK, OTHER], joints, constraints=[constraint])
+    for word in words:
+        assert word in str(error.value)
 
 
 def test_other_numbers_are_the_same_structure():

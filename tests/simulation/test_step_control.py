@@ -12,7 +12,7 @@ import linkax as lx
 from linkax.simulation.integration import MechanismControl, StepError, placements
 
 ARGS = SimpleNamespace(
-    system=SimpleNamespace(coordinate_units=jnp.array([1.0, 1e3])),
+    system=SimpleNamespace(units=jnp.array([1.0, 1e3])),
     accuracy=lx.Accuracy(rtol=1e-8),
     method=lx.Accuracy().method(np.float64),
     unpacked=lambda y: (y[:2], y[2:4]),

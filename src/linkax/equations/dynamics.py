@@ -61,10 +61,10 @@ def _onto_carrier(carrier, carried):
     return (onto @ carried.reshape(len(carrier), -1)).reshape(carried.shape)
 
 
-def applied_load(t, motion: Motion) -> Load:
+def applied_load(motion: Motion) -> Load:
     """The sum of what all force elements apply."""
-    loads = [force.load(t, motion) for force in motion.system.forces]
-    return reduce(lambda a, b: Load(*(x + y for x, y in zip(a, b, strict=True))), loads, Load.none(motion.system))
+    loads = [force.load(motion.configuration.t, motion) for force in motion.system.forces]
+    return reduce(Load.plus, loads, Load.none(motion.system))
 
 
 def inertial_wrench(motion: Motion, angular_acceleration, acceleration):
@@ -88,9 +88,9 @@ def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " 
     return dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body])
 
 
-def generalised_force(t, motion: Motion) -> Float[Array, " n_v"]:
+def generalised_force(motion: Motion) -> Float[Array, " n_v"]:
     """f of M v̇ = f: applied forces less velocity-product forces [N m, N]."""
-    load = applied_load(t, motion)
+    load = applied_load(motion)
     force, moment = inertial_wrench(motion, motion.angular_bias[:-1], motion.bias[:-1])
     return load.joint_force + along_speeds(motion.configuration, load.force - force, load.moment - moment)
 

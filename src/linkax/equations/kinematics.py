@@ -11,13 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from linkax.equations.coordinates import by_speed
 from linkax.equations.system import System
+from linkax.model.bodies import GROUND_NAME, Frame
+from linkax.model.forces import Load
+from linkax.model.numbers import value
+from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, cross, rotate, transpose
 
 
 class Configuration(eqx.Module):
-    """Where all bodies are at coordinates q. Last row of body arrays with n_b + 1 rows: ground.
+    """Where all bodies are at time t and coordinates q. Last row of body arrays with n_b + 1 rows: ground.
 
     - `rotation`: orientation of each body, axes as columns, (n_b + 1, 3, 3).
     - `link`: from the predecessor's reference point to the body's, without anchors [m], (n_b, 3).
@@ -29,9 +34,14 @@ class Configuration(eqx.Module):
     - `angular`, `sliding`: motion subspace of each speed: angular velocity, and velocity at the
       origin of the child's frame, of the moved body per unit speed, (n_v, 3).
     - `linear`: the same velocity at the anchor of the tree, (n_v, 3).
+    - `child_axes`: h¹, h², h³ of each cut joint on its child, as columns, (n_cut, 3, 3).
+    - `separation`: of each cut joint, from the origin on the parent to that on the child [m],
+      (n_cut, 3). It is summed around the loop from the common ancestor, not from the world's origin.
     """
 
     system: System
+    t: Float[Array, ""]
+    q: Float[Array, " n_q"]
     rotation: Float[Array, "n_b+1 3 3"]
     link: Float[Array, "n_b 3"]
     position: Float[Array, "n_b+1 3"]
@@ -41,6 +51,13 @@ class Configuration(eqx.Module):
     angular: Float[Array, "n_v 3"]
     sliding: Float[Array, "n_v 3"]
     linear: Float[Array, "n_v 3"]
+    child_axes: Float[Array, "n_cut 3 3"]
+    separation: Float[Array, "n_cut 3"]
+
+    @property
+    def parent_axes(self) -> Float[Array, "n_cut 3 3"]:
+        """h¹, h², h³ of each cut joint on its parent, as columns."""
+        return self.joint_axes[self.system.topology.num_bodies :]
 
     def center_of_mass(self) -> Float[Array, "n_b 3"]:
         """Centre of mass of each body from its reference point, in ground axes [m]."""
@@ -55,9 +72,72 @@ class Configuration(eqx.Module):
         """Centre of mass of each body in the world [m]."""
         return self.world_position() + self.center_of_mass()
 
+    def body(self, name: str) -> int:
+        """Index of a body, or of ground."""
+        return GROUND_INDEX if name == GROUND_NAME else self.system.topology.bodies.index(name)
+
+    def arm(self, frame: Frame) -> Float[Array, "3"]:
+        """From the reference point of a frame's body to its origin, in ground axes [m]."""
+        return self.rotation[self.body(frame.body)] @ jnp.asarray(frame.offset, self.system.dtype)
+
+    def axes(self, frame: Frame) -> Float[Array, "3 3"]:
+        """Axes of a frame, as columns."""
+        return self.rotation[self.body(frame.body)] @ jnp.asarray(value(frame.rotation), self.system.dtype)
+
+    def _place(self, frame):
+        """Origin of a frame from the anchor of its tree, and that anchor."""
+        body = self.body(frame.body)
+        if body == GROUND_INDEX:
+            return jnp.zeros(3, self.system.dtype), jnp.asarray(frame.offset, self.system.dtype)
+        return self.position[body] + self.arm(frame), self.system.anchor[self.system.topology.root[body]]
+
+    def point(self, frame: Frame) -> Float[Array, "3"]:
+        """Origin of a frame in the world [m]."""
+        return sum(self._place(frame))
+
+    def between(self, first: Frame, second: Frame) -> Float[Array, "3"]:
+        """From the origin of one frame to that of another [m]."""
+        (near, near_anchor), (far, far_anchor) = self._place(first), self._place(second)
+        return (far - near) + (far_anchor - near_anchor)
+
+    def joint_coordinates(self, name: str) -> Float[Array, " n"]:
+        """Coordinates of a joint, in the tree or cut [rad or m]."""
+        topology = self.system.topology
+        if name in topology.coordinates:
+            return self.q[topology.coordinates[name]]
+        kind, axes, cut = self._cut(name)
+        return kind.measure(axes.T @ self.child_axes[cut], axes.T @ self.separation[cut])
+
+    def joint_displacement(self, term: Term, origin) -> Float[Array, ""]:
+        """One coordinate of a joint from an origin; angles of a cut joint in [−π, π)."""
+        index, topology = term.index or 0, self.system.topology
+        if term.joint in topology.speeds:
+            return by_speed(topology, self.q)[topology.column(term)] - origin
+        kind = topology.joint_types[topology.joints.index(term.joint)]
+        displacement = self.joint_coordinates(term.joint)[index + kind.has_quaternion] - origin
+        return wrapped(displacement, kind.speed_units[index] == "rad")
+
+    def _cut(self, name):
+        """Type, axes on the parent, and index of a cut joint."""
+        topology = self.system.topology
+        joint = topology.joints.index(name)
+        return topology.joint_types[joint], self.joint_axes[joint], joint - topology.num_bodies
+
+    def cut_subspace(self, name: str):
+        """Motion subspace of a cut joint in ground axes, angular and linear part, (n, 3) each.
+
+        Its columns dotted with a relative twist are the joint's speeds; as many wrenches are its forces.
+        """
+        kind, axes, _ = self._cut(name)
+        angular = jnp.asarray(np.array(kind.angular_subspace).reshape(-1, 3), axes.dtype)
+        linear = jnp.asarray((not kind.is_screw) * np.array(kind.linear_subspace).reshape(-1, 3), axes.dtype)
+        if kind.angular_subspace_at is not None:
+            angular = kind.angular_subspace_at(self.joint_coordinates(name))
+        return angular @ axes.T, linear @ axes.T
+
 
 class Motion(eqx.Module):
-    """How all bodies move at (q, v).
+    """How all bodies move at (t, q, v): what a force element reads, and how it makes its load.
 
     - `angular_velocity` [rad/s], (n_b + 1, 3); `velocity` of reference points [m/s], (n_b + 1, 3).
     - `angular_bias` [rad/s²], `bias` [m/s²]: accelerations that velocities alone cause (the
@@ -67,6 +147,7 @@ class Motion(eqx.Module):
     """
 
     configuration: Configuration
+    v: Float[Array, " n_v"]
     angular_velocity: Float[Array, "n_b+1 3"]
     velocity: Float[Array, "n_b+1 3"]
     angular_bias: Float[Array, "n_b+1 3"]
@@ -79,6 +160,71 @@ class Motion(eqx.Module):
     @property
     def system(self) -> System:
         return self.configuration.system
+
+    def joint(self, name: str):
+        """Coordinate of a joint, in the tree or cut [rad or m]; (n,) where it has several."""
+        return _alone(self.configuration.joint_coordinates(name))
+
+    def joint_speed(self, name: str):
+        """Speed of a joint, in the tree or cut [rad/s or m/s]; (n,) where it has several."""
+        return _alone(self.joint_speeds(name))
+
+    def joint_speeds(self, name: str) -> Float[Array, " n"]:
+        """Speeds of a joint, in the tree or cut [rad/s or m/s]."""
+        topology, configuration = self.system.topology, self.configuration
+        if name in topology.speeds:
+            return self.v[topology.speeds[name]]
+        joint = topology.joints.index(name)
+        parent, child, cut = topology.parent[joint], topology.child[joint], joint - topology.num_bodies
+        omega = self.angular_velocity
+        on_child = self.velocity[child] + cross(omega[child], configuration.child_arm[joint])
+        arm = configuration.parent_arm[joint] + configuration.separation[cut]
+        seen = on_child - self.velocity[parent] - cross(omega[parent], arm)
+        angular, linear = configuration.cut_subspace(name)
+        return angular @ (omega[child] - omega[parent]) + linear @ seen
+
+    def joint_rate(self, term: Term) -> Float[Array, ""]:
+        """One speed of a joint [rad/s or m/s]."""
+        return self.joint_speeds(term.joint)[term.index or 0]
+
+    def joint_load(self, term: Term, force) -> Load:
+        """A torque [N m], or force [N] on a slide, along one speed of a joint, on the child."""
+        topology, configuration, none = self.system.topology, self.configuration, Load.none(self.system)
+        if term.joint in topology.speeds:
+            return none._replace(joint_force=none.joint_force.at[topology.column(term)].set(force))
+        joint = topology.joints.index(term.joint)
+        parent, child, cut = topology.parent[joint], topology.child[joint], joint - topology.num_bodies
+        angular, linear = (columns[term.index or 0] * force for columns in configuration.cut_subspace(term.joint))
+        on_parent = configuration.parent_arm[joint] + configuration.separation[cut]
+        load = self._wrench(child, configuration.child_arm[joint], linear, angular)
+        return load.plus(self._wrench(parent, on_parent, -linear, -angular))
+
+    def point_velocity(self, frame: Frame) -> Float[Array, "3"]:
+        """Velocity of the origin of a frame [m/s]."""
+        body = self.configuration.body(frame.body)
+        return self.velocity[body] + cross(self.angular_velocity[body], self.configuration.arm(frame))
+
+    def point_load(self, frame: Frame, force) -> Load:
+        """A force at the origin of a frame, in ground axes [N]; one on the ground does nothing."""
+        nothing = jnp.zeros(3, self.system.dtype)
+        return self._wrench(self.configuration.body(frame.body), self.configuration.arm(frame), force, nothing)
+
+    def _wrench(self, body, arm, force, moment) -> Load:
+        """A force at a point of a body, and a moment."""
+        none = Load.none(self.system)
+        if body == GROUND_INDEX:
+            return none
+        about_mass = moment + cross(arm - self.configuration.center_of_mass()[body], force)
+        return none._replace(force=none.force.at[body].set(force), moment=none.moment.at[body].set(about_mass))
+
+
+def _alone(values):
+    return values[0] if len(values) == 1 else values
+
+
+def wrapped(angles, is_angle):
+    """Differences of angles brought into [−π, π); lengths left as they are."""
+    return jnp.where(is_angle, jnp.mod(angles + jnp.pi, 2.0 * jnp.pi) - jnp.pi, angles)
 
 
 def along_path(system: System, edges):
@@ -103,12 +249,20 @@ def by_body(system: System, columns):
     return jnp.zeros((topology.num_bodies, 3), columns.dtype).at[topology.column_body].add(columns)
 
 
-def configure(system: System, q: Float[Array, " n_q"]) -> Configuration:
+def bodies_of_cuts(topology):
+    """Parent and child body of each cut joint, and the joints' indices."""
+    cuts = np.arange(topology.num_bodies, len(topology.joints))
+    return np.array(topology.parent, dtype=int)[cuts], np.array(topology.child, dtype=int)[cuts], cuts
+
+
+def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
     """Poses of all bodies and the motion subspaces of all joints at coordinates q."""
     topology, count = system.topology, system.topology.num_bodies
     parent, child = np.array(topology.parent), np.array(topology.child)
     reversed_ = topology.reversed[:, None]
-    turn, shift = _joint_motion(topology, q)
+    turn, angular_subspace = _joint_rotations(topology, q)
+    linear_subspace = _linear_subspace(system)
+    shift = by_body(system, linear_subspace * by_speed(topology, q)[:, None])
     relative = compose(compose(system.parent_axes[:count], turn), transpose(system.child_axes[:count]))
     if np.any(reversed_):
         relative = jnp.where(reversed_[:, :, None], transpose(relative), relative)
@@ -121,11 +275,16 @@ def configure(system: System, q: Float[Array, " n_q"]) -> Configuration:
     link = sign * (parent_arm - child_arm)[:count]
     position = along_path(system, link)
     subspace_axes = (sign[:, :, None] * joint_axes[:count])[topology.column_body]
-    angular = rotate(subspace_axes, jnp.asarray(_subspace(topology, "angular_subspace"), q.dtype))
-    sliding = rotate(subspace_axes, jnp.asarray(_subspace(topology, "linear_subspace"), q.dtype))
+    angular, sliding = rotate(subspace_axes, angular_subspace), rotate(subspace_axes, linear_subspace)
     joint_point = (position[child[:count]] + child_arm[:count])[topology.column_body]
+
+    on_parent, on_child, cuts = bodies_of_cuts(topology)
+    anchor = lambda body: system.anchor[np.where(topology.root[body] < 0, cuts, topology.root[body])]
+    around = jnp.asarray(topology.loop, system.dtype) @ link
     return Configuration(
         system=system,
+        t=t,
+        q=q,
         rotation=rotation,
         link=link,
         position=position,
@@ -135,30 +294,48 @@ def configure(system: System, q: Float[Array, " n_q"]) -> Configuration:
         angular=angular,
         sliding=sliding,
         linear=sliding + cross(joint_point, angular),
+        child_axes=compose(rotation[on_child], system.child_axes[cuts]),
+        separation=around + (child_arm[cuts] - parent_arm[cuts]) + (anchor(on_child) - anchor(on_parent)),
     )
 
 
-def _joint_motion(topology, q):
-    """Rotation (n_b, 3, 3) and displacement (n_b, 3) of each tree joint, in its own axes."""
+def _by_kind(topology):
+    """Joint types in the tree: for each its bodies, and where its coordinates lie in q, (n, n_q of one)."""
     kinds = topology.joint_types[: topology.num_bodies]
-    starts = [topology.coordinates[name].start for name in topology.joints[: topology.num_bodies]]
-    order, turns, shifts = [], [], []
     for kind in dict.fromkeys(kinds):
         members = [body for body, other in enumerate(kinds) if other is kind]
-        taken = np.array(starts)[members][:, None] + np.arange(len(kind.coordinate_units))
-        coordinates = q[taken.astype(int)]
-        turns.append(jax.vmap(kind.rotation)(coordinates))
-        shifts.append(jax.vmap(kind.displacement)(coordinates))
+        slices = [topology.coordinates[topology.joints[body]] for body in members]
+        yield kind, members, np.array([np.arange(taken.start, taken.stop) for taken in slices], dtype=int)
+
+
+def _joint_rotations(topology, q):
+    """Rotation of each tree joint, (n_b, 3, 3), and angular motion subspace of each speed, (n_v, 3), in joint axes."""
+    order, turns = [], []
+    subspace = jnp.asarray(_constant_subspace(topology, "angular_subspace"), q.dtype)
+    for kind, members, places in _by_kind(topology):
+        turns.append(jax.vmap(kind.rotation)(q[places]))
+        if kind.angular_subspace_at is not None:
+            columns = np.flatnonzero(np.isin(topology.column_body, members))
+            subspace = subspace.at[columns].set(jax.vmap(kind.angular_subspace_at)(q[places]).reshape(-1, 3))
         order += members
     if len(turns) == 1:
-        return turns[0], shifts[0]
-    place = np.argsort(order)
-    return jnp.concatenate(turns)[place], jnp.concatenate(shifts)[place]
+        return turns[0], subspace
+    return jnp.concatenate(turns)[np.argsort(order)], subspace
 
 
-def _subspace(topology, part):
+def _constant_subspace(topology, part):
     columns = [column for kind in topology.joint_types[: topology.num_bodies] for column in getattr(kind, part)]
     return np.array(columns).reshape(-1, 3)
+
+
+def _linear_subspace(system):
+    """Linear motion subspace of each speed in joint axes, (n_v, 3)."""
+    topology = system.topology
+    subspace = jnp.asarray(_constant_subspace(topology, "linear_subspace"), system.dtype)
+    screws = np.array([kind.is_screw for kind in topology.joint_types[: topology.num_bodies]])[topology.column_body]
+    if not np.any(screws):
+        return subspace
+    return jnp.where(screws[:, None], system.number[topology.column_body][:, None], 1.0) * subspace
 
 
 def _along_path_product(topology, relative):
@@ -183,6 +360,8 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
     edge_slide = by_body(system, configuration.sliding * v[:, None])
     omega = along_path(system, edge_turn)
     edge_angular_bias = cross(omega[parent], edge_turn)
+    if any(kind.angular_subspace_at is not None for kind in topology.joint_types[:count]):
+        edge_angular_bias = edge_angular_bias + _subspace_bias(configuration, v)
     alpha = along_path(system, edge_angular_bias)
 
     parent_rate, child_rate = cross(omega[parent], parent_arm), cross(omega[child], child_arm)
@@ -192,6 +371,7 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
     edge_bias = sign * (parent_bias - child_bias) + 2.0 * cross(omega[parent], edge_slide)
     return Motion(
         configuration=configuration,
+        v=v,
         angular_velocity=omega,
         velocity=along_path(system, edge_rate),
         angular_bias=alpha,
@@ -201,3 +381,23 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
         edge_angular_bias=edge_angular_bias,
         edge_bias=edge_bias,
     )
+
+
+def _subspace_bias(configuration, v):
+    """Angular accelerations by motion subspaces that turn with their own coordinates, (n_b, 3)."""
+    topology = configuration.system.topology
+    sign = jnp.where(topology.reversed, -1.0, 1.0).astype(v.dtype)
+    total = jnp.zeros((topology.num_bodies, 3), v.dtype)
+    for kind, members, places in _by_kind(topology):
+        if kind.angular_subspace_at is None:
+            continue
+        speeds = v[np.array([np.flatnonzero(topology.column_body == body) for body in members])]
+
+        def bias(q, rates, kind=kind):
+            turning = jax.jvp(kind.angular_subspace_at, (q,), (rates,))[1]
+            return rates @ turning
+
+        turned = jax.vmap(bias)(configuration.q[places], speeds)
+        axes = configuration.joint_axes[np.array(members)]
+        total = total.at[np.array(members)].set(sign[np.array(members)][:, None] * rotate(axes, turned))
+    return total

@@ -1,61 +1,30 @@
-"""Loop constraints of the cut joints: c(q) = 0, J v = 0, J v̇ = γ, rows of the paper's Table 1.
+"""Loop constraints: c(q, t) = 0, J v = b, J v̇ = γ.
 
-With h₁ⁱ, h₂ʲ the joint's axes on parent and child and s the separation of their origins, a
-rotation row is h₁ⁱ·h₂ʲ and a translation row h₁ⁱ·s / ℓ, ℓ half the way around the loop.
+Rows of cut joints are those of the paper's Table 1: with h₁ⁱ, h₂ʲ the joint's axes on parent and
+child and s the separation of their origins, a rotation row is h₁ⁱ·h₂ʲ and a translation row
+h₁ⁱ·s / ℓ, ℓ half the way around the loop. Some joint types combine several of these in one row. The
+last rows are constraints on coordinates of the tree, in radians and lengths of the mechanism.
 """
 
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.kinematics import Configuration, Motion
-from linkax.spatial.rotations import compose, cross, dot, rotate, transpose
+from linkax.equations.coordinates import by_speed
+from linkax.equations.kinematics import Configuration, Motion, bodies_of_cuts
+from linkax.equations.system import System
+from linkax.model.constraints import Drive
+from linkax.spatial.rotations import cross, dot, rotate, transpose
 
-
-class Cuts(eqx.Module):
-    """The two sides of every cut joint, in ground axes.
-
-    - `parent_axes`, `child_axes`: h₁ and h₂ as columns, (n_cut, 3, 3).
-    - `separation`: from the origin on the parent to that on the child [m], (n_cut, 3). It is
-      summed around the loop from the common ancestor, not from the world's origin.
-    """
-
-    configuration: Configuration
-    parent_axes: Float[Array, "n_cut 3 3"]
-    child_axes: Float[Array, "n_cut 3 3"]
-    separation: Float[Array, "n_cut 3"]
-
-
-def bodies_of_cuts(topology):
-    """Parent and child body of each cut joint, and the joints' indices."""
-    cuts = np.arange(topology.num_bodies, len(topology.joints))
-    return np.array(topology.parent, dtype=int)[cuts], np.array(topology.child, dtype=int)[cuts], cuts
-
-
-def cut_frames(configuration: Configuration) -> Cuts:
-    """Axes and separations of all cut joints."""
-    system, topology = configuration.system, configuration.system.topology
-    parent, child, cuts = bodies_of_cuts(topology)
-
-    def anchor(body):
-        root = topology.root[body]
-        return system.anchor[np.where(root < 0, cuts, root)]
-
-    around = jnp.asarray(topology.loop, system.dtype) @ configuration.link
-    ends = configuration.child_arm[cuts] - configuration.parent_arm[cuts]
-    return Cuts(
-        configuration=configuration,
-        parent_axes=configuration.joint_axes[cuts],
-        child_axes=compose(configuration.rotation[child], system.child_axes[cuts]),
-        separation=around + ends + (anchor(child) - anchor(parent)),
-    )
+FLIP_WEIGHT = 2.0  # more than one: axes that point apart are farther from being in line than those at a right angle
 
 
 class Rows(NamedTuple):
-    """The vectors that the chosen rows are made of: h₁ⁱ and h₂ʲ, and h₁ⁱ with its loop's ℓ."""
+    """The vectors that rows of cut joints are made of: h₁ⁱ and h₂ʲ, and h₁ⁱ with its loop's ℓ."""
 
     rotation_cut: np.ndarray
     translation_cut: np.ndarray
@@ -65,53 +34,93 @@ class Rows(NamedTuple):
     length: Float[Array, " n_tr"]
 
 
-def mobile_rows(cuts: Cuts) -> Rows:
-    """The rows that motion can change, rotation rows first."""
-    topology = cuts.configuration.system.topology
-    return _chosen(cuts, topology.rotation_rows, topology.translation_rows)
-
-
-def _chosen(cuts: Cuts, rotation_rows, translation_rows) -> Rows:
+def _chosen(configuration: Configuration, rotation_rows, translation_rows) -> Rows:
     rotation = np.array(rotation_rows, dtype=int).reshape(-1, 3)
     translation = np.array(translation_rows, dtype=int).reshape(-1, 2)
-    columns, other = transpose(cuts.parent_axes), transpose(cuts.child_axes)
+    columns, other = transpose(configuration.parent_axes), transpose(configuration.child_axes)
     return Rows(
         rotation_cut=rotation[:, 0],
         translation_cut=translation[:, 0],
         first=columns[rotation[:, 0], rotation[:, 1]],
         second=other[rotation[:, 0], rotation[:, 2]],
         direction=columns[translation[:, 0], translation[:, 1]],
-        length=cuts.configuration.system.loop_length[translation[:, 0]],
+        length=configuration.system.loop_length[translation[:, 0]],
     )
 
 
-def _residual(cuts: Cuts, rows: Rows):
+def plain_rows(configuration: Configuration) -> Rows:
+    """The rotation and translation rows that motion can change."""
+    topology = configuration.system.topology
+    return _chosen(configuration, topology.rotation_rows, topology.translation_rows)
+
+
+def combined_rows(configuration: Configuration) -> Rows:
+    """The rotation and translation rows that combined rows are functions of."""
+    topology = configuration.system.topology
+    kinds = topology.joint_types[topology.num_bodies :]
+    rotations = [(cut, i, j) for cut in topology.combining for i, j in kinds[cut].combined_rotations]
+    translations = [(cut, i) for cut in topology.combining for i in kinds[cut].combined_translations]
+    return _chosen(configuration, rotations, translations)
+
+
+def _combine(system: System, rows: Float[Array, " n"]) -> Float[Array, " n_combined"]:
+    """Combined rows from those of `combined_rows`."""
+    topology, found = system.topology, []
+    kinds = topology.joint_types[topology.num_bodies :]
+    count = sum(len(kinds[cut].combined_rotations) for cut in topology.combining)
+    rotations, translations = rows[:count], rows[count:]
+    for cut in topology.combining:
+        turns, moves = len(kinds[cut].combined_rotations), len(kinds[cut].combined_translations)
+        number = system.number[topology.num_bodies + cut] / system.loop_length[cut]
+        found.append(kinds[cut].combined(rotations[:turns], translations[:moves], number))
+        rotations, translations = rotations[turns:], translations[moves:]
+    return jnp.stack(found)
+
+
+def _residual(configuration: Configuration, rows: Rows):
     rotation = dot(rows.first, rows.second)
-    translation = dot(rows.direction, cuts.separation[rows.translation_cut]) / rows.length
+    translation = dot(rows.direction, configuration.separation[rows.translation_cut]) / rows.length
     return jnp.concatenate([rotation, translation])
 
 
-def residual(cuts: Cuts) -> Float[Array, " m"]:
-    """c(q): the rows that motion can change."""
-    return _residual(cuts, mobile_rows(cuts))
+def _right_sides(system: System, t):
+    """Right sides of the constraints on coordinates, (k,)."""
+    sides = [jnp.asarray(constraint.right_side(t), system.dtype) for constraint in system.constraints]
+    return jnp.stack(sides) / system.coupling_unit
 
 
-def immobile_residual(cuts: Cuts) -> Float[Array, " m_immobile"]:
+def is_driven(system: System) -> bool:
+    """Whether a drive moves the mechanism with time."""
+    return any(isinstance(constraint, Drive) for constraint in system.constraints)
+
+
+def residual(configuration: Configuration) -> Float[Array, " m"]:
+    """c(q, t): the rows that motion can change."""
+    system = configuration.system
+    rows = [_residual(configuration, plain_rows(configuration))]
+    if system.topology.combining:
+        rows.append(_combine(system, _residual(configuration, combined_rows(configuration))))
+    if system.constraints:
+        coordinates = by_speed(system.topology, configuration.q)
+        rows.append(system.coupling @ coordinates / system.coupling_unit - _right_sides(system, configuration.t))
+    return jnp.concatenate(rows)
+
+
+def immobile_residual(configuration: Configuration) -> Float[Array, " m_immobile"]:
     """The rows that no motion can change; nonzero where the loop cannot be closed."""
-    topology = cuts.configuration.system.topology
-    return _residual(cuts, _chosen(cuts, topology.immobile_rotation_rows, topology.immobile_translation_rows))
+    topology = configuration.system.topology
+    rows = _chosen(configuration, topology.immobile_rotation_rows, topology.immobile_translation_rows)
+    return _residual(configuration, rows)
 
 
-def jacobian(cuts: Cuts) -> Float[Array, "m n_v"]:
-    """J = ∂ċ/∂v."""
-    configuration, topology = cuts.configuration, cuts.configuration.system.topology
+def _jacobian(configuration: Configuration, rows: Rows):
+    topology = configuration.system.topology
     parent, child, joints = bodies_of_cuts(topology)
-    rows, body = mobile_rows(cuts), topology.column_body
-    loop = topology.loop[:, body]
+    loop = topology.loop[:, topology.column_body]
     turning = cross(rows.second, rows.first) @ configuration.angular.T
     # The twist of each joint at the point where the loop is cut, reached along its own side.
     on_child = configuration.position[child] + configuration.child_arm[joints]
-    on_parent = configuration.position[parent] + configuration.parent_arm[joints] + cuts.separation
+    on_parent = configuration.position[parent] + configuration.parent_arm[joints] + configuration.separation
     at, along = rows.translation_cut, rows.direction
     swept = jnp.where(
         loop[at] > 0.0,
@@ -123,11 +132,52 @@ def jacobian(cuts: Cuts) -> Float[Array, "m n_v"]:
     return signs * jnp.concatenate([turning, moving])
 
 
-def bias(cuts: Cuts, motion: Motion) -> Float[Array, " m"]:
-    """γ of J v̇ = γ: minus all terms of c̈ that velocities alone cause."""
+def _combination(configuration: Configuration):
+    """Values of the rows that combined rows are functions of, and their Jacobian."""
+    rows = combined_rows(configuration)
+    return _residual(configuration, rows), _jacobian(configuration, rows)
+
+
+def _combining_factors(configuration: Configuration, values) -> Float[Array, "n_combined n"]:
+    return jax.jacfwd(lambda values: _combine(configuration.system, values))(values)
+
+
+def jacobian(configuration: Configuration) -> Float[Array, "m n_v"]:
+    """J = ∂ċ/∂v."""
+    system = configuration.system
+    rows = [_jacobian(configuration, plain_rows(configuration))]
+    if system.topology.combining:
+        values, slopes = _combination(configuration)
+        rows.append(_combining_factors(configuration, values) @ slopes)
+    if system.constraints:
+        rows.append(system.coupling / system.coupling_unit[:, None])
+    return jnp.concatenate(rows)
+
+
+def rate(system: System, t) -> Float[Array, " m"]:
+    """b of J v = b: what drives ask for."""
+    nothing = jnp.zeros(system.topology.num_rows, system.dtype)
+    if not is_driven(system):
+        return nothing
+    sides = jax.jvp(lambda t: _right_sides(system, t), (t,), (jnp.ones_like(t),))[1]
+    return nothing.at[-len(system.constraints) :].set(sides)
+
+
+def drive_acceleration(system: System, t) -> Float[Array, " m"]:
+    """The part of γ that drives ask for."""
+    nothing = jnp.zeros(system.topology.num_rows, system.dtype)
+    if not is_driven(system):
+        return nothing
+    sides = jax.jvp(lambda t: rate(system, t), (t,), (jnp.ones_like(t),))[1]
+    return sides
+
+
+def _bias(motion: Motion, rows: Rows):
+    """Minus all terms of c̈ that velocities alone cause, of rotation and translation rows."""
     configuration, topology = motion.configuration, motion.system.topology
     parent, child, joints = bodies_of_cuts(topology)
-    rows, loop = mobile_rows(cuts), jnp.asarray(topology.loop, cuts.separation.dtype)
+    separation = configuration.separation
+    loop = jnp.asarray(topology.loop, separation.dtype)
     omega, alpha = motion.angular_velocity, motion.angular_bias
 
     at = rows.rotation_cut
@@ -148,59 +198,117 @@ def bias(cuts: Cuts, motion: Motion) -> Float[Array, " m"]:
     rate = loop @ motion.edge_rate + arm_rate(child, child_arm) - arm_rate(parent, parent_arm)
     acceleration = loop @ motion.edge_bias + arm_bias(child, child_arm) - arm_bias(parent, parent_arm)
     # Seen from the parent: Coriolis and the parent's own turning taken off.
-    seen = acceleration - 2.0 * cross(omega[parent], rate) - cross(alpha[parent], cuts.separation)
-    seen = seen + cross(omega[parent], cross(omega[parent], cuts.separation))
+    seen = acceleration - 2.0 * cross(omega[parent], rate) - cross(alpha[parent], separation)
+    seen = seen + cross(omega[parent], cross(omega[parent], separation))
     translation = dot(rows.direction, seen[rows.translation_cut]) / rows.length
     return -jnp.concatenate([rotation, translation])
 
 
-def locked_separation(cuts: Cuts) -> Float[Array, "n_cut 3"]:
+def bias(motion: Motion) -> Float[Array, " m"]:
+    """γ of J v̇ = γ less `drive_acceleration`: quadratic in the speeds."""
+    system, configuration = motion.system, motion.configuration
+    rows = [_bias(motion, plain_rows(configuration))]
+    if system.topology.combining:
+        values, slopes = _combination(configuration)
+        turn = slopes @ motion.v
+        combine = lambda values: _combine(system, values)
+        along = lambda values: jax.jvp(combine, (values,), (turn,))[1]
+        bent = jax.jvp(along, (values,), (turn,))[1]
+        factors = _combining_factors(configuration, values)
+        rows.append(factors @ _bias(motion, combined_rows(configuration)) - bent)
+    if system.constraints:
+        rows.append(jnp.zeros(len(system.constraints), system.dtype))
+    return jnp.concatenate(rows)
+
+
+def gamma(motion: Motion) -> Float[Array, " m"]:
+    """γ of J v̇ = γ."""
+    return bias(motion) + drive_acceleration(motion.system, motion.configuration.t)
+
+
+class Multipliers(NamedTuple):
+    """Multipliers sorted by what they act on.
+
+    - `plain`, `combined`: of the rows of cut joints in `plain_rows` and `combined_rows`.
+    - `constraints`: generalised force of each constraint on coordinates, per unit of coefficient.
+    """
+
+    plain: Float[Array, " n"]
+    combined: Float[Array, " n"]
+    constraints: Float[Array, " k"]
+
+
+def sorted_multipliers(configuration: Configuration, multipliers: Float[Array, " m"]) -> Multipliers:
+    """The multipliers λ of all rows by what they act on."""
+    system, topology = configuration.system, configuration.system.topology
+    count = topology.num_rows - len(system.constraints)
+    plain, combined, constraints = jnp.split(multipliers, [count - len(topology.combining), count])
+    if topology.combining:
+        combined = combined @ _combining_factors(configuration, _residual(configuration, combined_rows(configuration)))
+    return Multipliers(plain, combined, constraints / system.coupling_unit)
+
+
+def locked_separation(configuration: Configuration) -> Float[Array, "n_cut 3"]:
     """The part of the separations along locked directions, in joint axes of the parent [m]."""
-    topology = cuts.configuration.system.topology
+    topology = configuration.system.topology
     kinds = topology.joint_types[topology.num_bodies :]
     locked = np.array([[i in kind.locked_translations for i in range(3)] for kind in kinds]).reshape(-1, 3)
-    return jnp.where(locked, rotate(transpose(cuts.parent_axes), cuts.separation), 0.0)
+    return jnp.where(locked, rotate(transpose(configuration.parent_axes), configuration.separation), 0.0)
 
 
-def as_if_closed(cuts: Cuts) -> Cuts:
-    """The same cuts without the separation that should not be there.
+def as_if_closed(configuration: Configuration) -> Configuration:
+    """The same configuration without the separations that should not be there.
 
-    The Jacobian of these is the better direction to close a loop in from far away: rows along
+    The Jacobian of it is the better direction to close a loop in from far away: rows along
     axes that turn with the parent would otherwise trade turning against closing.
     """
-    return eqx.tree_at(
-        lambda c: c.separation, cuts, cuts.separation - rotate(cuts.parent_axes, locked_separation(cuts))
-    )
+    apart = rotate(configuration.parent_axes, locked_separation(configuration))
+    return eqx.tree_at(lambda c: c.separation, configuration, configuration.separation - apart)
+
+
+def flips(configuration: Configuration):
+    """Rows that vanish unless axes that a cut joint holds in line point apart, and their Jacobian.
+
+    Locked rotations alone would also be satisfied by axes that point opposite ways.
+    """
+    topology = configuration.system.topology
+    kinds = topology.joint_types[topology.num_bodies :]
+    rows = _chosen(configuration, [(cut, i, i) for cut, kind in enumerate(kinds) for i in kind.aligned_axes], [])
+    cosine, slopes = _residual(configuration, rows), _jacobian(configuration, rows)
+    apart = cosine < 0.0
+    return jnp.where(apart, FLIP_WEIGHT * cosine, 0.0), jnp.where(apart[:, None], FLIP_WEIGHT * slopes, 0.0)
 
 
 class Gap(NamedTuple):
-    """How far each cut joint is open.
+    """How far constraints are open.
 
-    - `distance`: along its locked directions [m]; `angle`: between axes that it holds in line
-      [rad], (n_cut,) each.
+    - `distance`: of each cut joint along its locked directions [m], its combined row included;
+      `angle`: between axes that it holds in line [rad], (n_cut,) each.
+    - `constraints`: of each constraint on coordinates, in the units of its sum, (k,).
     """
 
     distance: Float[Array, " n_cut"]
     angle: Float[Array, " n_cut"]
+    constraints: Float[Array, " k"]
 
 
-def gaps(cuts: Cuts) -> Gap:
-    """How far each cut joint is open, rows that no motion changes included."""
-    topology = cuts.configuration.system.topology
+def gaps(configuration: Configuration) -> Gap:
+    """How far constraints are open, rows that no motion changes included."""
+    system, topology = configuration.system, configuration.system.topology
     kinds = topology.joint_types[topology.num_bodies :]
     held = np.array([[i in kind.aligned_axes for i in range(3)] for kind in kinds]).reshape(-1, 3)
-    across = jnp.linalg.norm(cross(transpose(cuts.parent_axes), transpose(cuts.child_axes)), axis=-1)
-    angle = jnp.arctan2(across, jnp.sum(cuts.parent_axes * cuts.child_axes, axis=-2))
+    parent_axes, child_axes = configuration.parent_axes, configuration.child_axes
+    across = jnp.linalg.norm(cross(transpose(parent_axes), transpose(child_axes)), axis=-1)
+    angle = jnp.arctan2(across, jnp.sum(parent_axes * child_axes, axis=-2))
+    rows = residual(configuration)
+    first, last = topology.num_rows - len(topology.combining) - len(system.constraints), len(system.constraints)
+    combined = jnp.zeros(topology.num_cuts, system.dtype)
+    if topology.combining:
+        cuts = np.array(topology.combining)
+        combined = combined.at[cuts].set(rows[first : topology.num_rows - last] * system.loop_length[cuts])
+    distance = jnp.concatenate([locked_separation(configuration), combined[:, None]], axis=1)
     return Gap(
-        distance=jnp.linalg.norm(locked_separation(cuts), axis=-1),
+        distance=jnp.linalg.norm(distance, axis=-1),
         angle=jnp.max(jnp.where(held, angle, 0.0), axis=-1, initial=0.0),
+        constraints=jnp.abs(rows[topology.num_rows - last :] * system.coupling_unit),
     )
-
-
-def measure(cuts: Cuts, joint: int) -> Float[Array, " n"]:
-    """Coordinates of the cut joint of that index in the mechanism's joints [rad, m]."""
-    topology = cuts.configuration.system.topology
-    cut = joint - topology.num_bodies
-    axes = cuts.parent_axes[cut]
-    kind = topology.joint_types[joint]
-    return kind.measure(axes.T @ cuts.child_axes[cut], axes.T @ cuts.separation[cut])

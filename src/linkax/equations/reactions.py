@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
-from linkax.equations.kinematics import Motion, by_body, over_subtree
-from linkax.equations.loops import Cuts, bodies_of_cuts, mobile_rows
+from linkax.equations.kinematics import Configuration, Motion, bodies_of_cuts, by_body, over_subtree
+from linkax.equations.loops import Rows, combined_rows, plain_rows, sorted_multipliers
 from linkax.spatial.rotations import cross
 
 
@@ -23,33 +23,55 @@ class Reaction(NamedTuple):
     moment: Float[Array, "... 3"]
 
 
-def cut_reactions(cuts: Cuts, multipliers) -> Reaction:
+def cut_reactions(configuration: Configuration, multipliers) -> Reaction:
     """Reactions of the cut joints, (n_cut, 3) each: the paper's Table 3, by virtual power."""
-    rows = mobile_rows(cuts)
+    found = sorted_multipliers(configuration, multipliers)
+    nothing = jnp.zeros_like(configuration.separation)
+    reaction = _added(Reaction(nothing, nothing), plain_rows(configuration), found.plain)
+    if configuration.system.topology.combining:
+        reaction = _added(reaction, combined_rows(configuration), found.combined)
+    return reaction
+
+
+def _added(reaction: Reaction, rows: Rows, multipliers) -> Reaction:
     of_rotations, of_translations = jnp.split(multipliers, [len(rows.rotation_cut)])
-    nothing = jnp.zeros_like(cuts.separation)
-    moment = nothing.at[rows.rotation_cut].add(of_rotations[:, None] * cross(rows.second, rows.first))
-    force = nothing.at[rows.translation_cut].add((of_translations / rows.length)[:, None] * rows.direction)
-    return Reaction(force, moment)
+    moments = of_rotations[:, None] * cross(rows.second, rows.first)
+    forces = (of_translations / rows.length)[:, None] * rows.direction
+    return Reaction(
+        reaction.force.at[rows.translation_cut].add(forces), reaction.moment.at[rows.rotation_cut].add(moments)
+    )
 
 
-def reactions(t, motion: Motion, cuts: Cuts, acceleration, multipliers) -> Reaction:
+def reactions(motion: Motion, acceleration, multipliers) -> Reaction:
     """Reactions of all joints, (n_j, 3) each, tree joints first.
 
     A tree joint carries what its subtree needs: inertia less applied loads less the reactions
     of cut joints on it (recursive Newton-Euler; the paper's Fig. 6).
     """
-    configuration, system, topology = motion.configuration, motion.system, motion.system.topology
-    count = topology.num_bodies
-    load, cut = applied_load(t, motion), cut_reactions(cuts, multipliers)
+    load = applied_load(motion)
     force, moment = inertial_wrench(motion, *body_accelerations(motion, acceleration))
-    force, moment = force - load.force, moment - load.moment
+    return _carried(motion.configuration, force - load.force, moment - load.moment, load.joint_force, multipliers)
+
+
+def reactions_to_multipliers(configuration: Configuration, multipliers) -> Reaction:
+    """The part of all joints' reactions that multipliers alone cause, (n_j, 3) each."""
+    nothing = jnp.zeros((configuration.system.topology.num_bodies, 3), configuration.system.dtype)
+    none = jnp.zeros(configuration.system.topology.num_speeds, configuration.system.dtype)
+    return _carried(configuration, nothing, nothing, none, multipliers)
+
+
+def _carried(configuration: Configuration, force, moment, joint_force, multipliers) -> Reaction:
+    """Reactions where bodies need these wrenches, (n_b, 3) each, the moment about the centre of mass."""
+    system, topology = configuration.system, configuration.system.topology
+    count = topology.num_bodies
+    cut = cut_reactions(configuration, multipliers)
+    joint_force = joint_force + sorted_multipliers(configuration, multipliers).constraints @ system.coupling
     moment = moment + cross(configuration.position[:-1] + configuration.center_of_mass(), force)
 
     # All moments about the anchor of each body's tree from here on.
     parent, child, joints = bodies_of_cuts(topology)
     on_child = configuration.position[child] + configuration.child_arm[joints]
-    on_parent = configuration.position[parent] + configuration.parent_arm[joints] + cuts.separation
+    on_parent = configuration.position[parent] + configuration.parent_arm[joints] + configuration.separation
 
     def onto_bodies(on_children, on_parents):
         padded = jnp.zeros((count + 1, 3), system.dtype).at[child].add(on_children).at[parent].add(-on_parents)
@@ -63,8 +85,10 @@ def reactions(t, motion: Motion, cuts: Cuts, acceleration, multipliers) -> React
     joint_child = np.array(topology.child)[:count]
     point = configuration.position[joint_child] + configuration.child_arm[:count]
     moment = moment - cross(point, force)
-    along = load.joint_force[:, None]
-    force = force - by_body(system, along * configuration.sliding)
+    along = joint_force[:, None]
+    # On a screw it is a torque.
+    slides = np.array([not kind.is_screw for kind in topology.joint_types[:count]])[topology.column_body]
+    force = force - by_body(system, slides[:, None] * along * configuration.sliding)
     moment = moment - by_body(system, along * configuration.angular)
     sign = jnp.where(topology.reversed[:, None], -1.0, 1.0).astype(system.dtype)
     return Reaction(jnp.concatenate([sign * force, cut.force]), jnp.concatenate([sign * moment, cut.moment]))

@@ -6,6 +6,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
@@ -20,8 +21,11 @@ class System(eqx.Module):
       zero on ground, whose part is kept apart in `anchor` [m] (n_j, 3), world axes, so that
       a mechanism far from the origin loses no digits.
     - `parent_axes`, `child_axes` (n_j, 3, 3): the joint's axes as columns, in body axes.
+    - `number` [m] (n_j,): the number of a joint whose type has one.
     - `loop_length` [m] (n_cut,): half the way around each loop, the unit of its translation rows.
     - `length` [m]: the mechanism's length, the unit of sliding coordinates.
+    - `coupling` (k, n_v): coefficients of the constraints on coordinates of the tree, and
+      `coupling_unit` (k,): the largest of each, in radians and lengths of the mechanism.
     """
 
     topology: Topology = eqx.field(static=True)
@@ -33,8 +37,12 @@ class System(eqx.Module):
     anchor: Float[Array, "n_j 3"]
     parent_axes: Float[Array, "n_j 3 3"]
     child_axes: Float[Array, "n_j 3 3"]
+    number: Float[Array, " n_j"]
     loop_length: Float[Array, " n_cut"]
     length: Float[Array, ""]
+    coupling: Float[Array, "k n_v"]
+    coupling_unit: Float[Array, " k"]
+    constraints: tuple[AbstractConstraint, ...]
     forces: tuple[AbstractForce, ...]
 
     @property
@@ -42,8 +50,8 @@ class System(eqx.Module):
         return self.mass.dtype
 
     @property
-    def coordinate_units(self) -> Float[Array, " n_q"]:
-        """What one unit of each coordinate is: 1 rad, or the mechanism's length [m]."""
+    def units(self) -> Float[Array, " n_v"]:
+        """What one unit of each speed, or of a small change, is: 1 rad, or the mechanism's length [m]."""
         return jnp.where(self.topology.slides, self.length, jnp.ones((), self.dtype))
 
 
@@ -62,6 +70,8 @@ def system_of(mechanism: Mechanism, dtype) -> System:
     child_on_ground = (np.array(topology.child) == GROUND_INDEX)[:, None]
     center_of_mass = stack([body.center_of_mass for body in mechanism.bodies], (3,))
     loop_length, length = _lengths(topology, *map(lax.stop_gradient, (parent_offset, child_offset, center_of_mass)))
+    coupling = _coupling(mechanism, dtype)
+    slides = jnp.where(topology.slides, length, jnp.ones((), dtype))
     return System(
         topology=topology,
         mass=stack([body.mass for body in mechanism.bodies], ()),
@@ -72,10 +82,24 @@ def system_of(mechanism: Mechanism, dtype) -> System:
         anchor=jnp.where(parent_on_ground, parent_offset, jnp.where(child_on_ground, child_offset, 0.0)),
         parent_axes=stack([parent for parent, _ in frames], (3, 3)),
         child_axes=stack([child for _, child in frames], (3, 3)),
+        number=stack([0.0 if joint.number is None else joint.number for joint in joints], ()),
         loop_length=loop_length,
         length=length,
+        coupling=coupling,
+        coupling_unit=jnp.max(jnp.abs(lax.stop_gradient(coupling)) * slides, axis=1),
+        constraints=mechanism.constraints,
         forces=mechanism.forces,
     )
+
+
+def _coupling(mechanism, dtype):
+    """Coefficients of the constraints on coordinates of the tree, (k, n_v)."""
+    topology, constraints = mechanism.topology, mechanism.constraints
+    coupling = jnp.zeros((len(constraints), topology.num_speeds), dtype)
+    for row, constraint in enumerate(constraints):
+        columns = np.array([topology.column(term) for term in constraint.terms])
+        coupling = coupling.at[row, columns].set(jnp.asarray(constraint.coefficients, dtype))
+    return coupling
 
 
 def _lengths(topology, parent_offset, child_offset, center_of_mass):

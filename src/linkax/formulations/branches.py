@@ -1,6 +1,6 @@
 """Branches of motion that cross in a singular configuration: which one a state is on.
 
-Where the rank of J falls, more speeds satisfy J v = 0 than motions exist. A motion has an
+Where the rank of J falls, more speeds satisfy J v = b than motions exist. A motion has an
 acceleration, so γ must lie in the range of J: uᵀγ(v, v) = 0 for every u with uᵀJ = 0, quadratic
 equations for the speeds, whose solutions are the branches.
 """
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from linkax.equations.kinematics import Configuration, configure, move
-from linkax.equations.loops import Cuts, bias, cut_frames, jacobian
+from linkax.equations.loops import bias, drive_acceleration, jacobian
 from linkax.equations.system import System
 from linkax.linalg.constrained_solve import Inverse, invert
 from linkax.linalg.pivoted_qr import pivoted_qr
@@ -26,28 +26,36 @@ class Crossing(eqx.Module):
     """
 
     configuration: Configuration
-    cuts: Cuts
     jacobian: Float[Array, "m n_v"]
     inverse: Inverse
 
     @staticmethod
-    def at(system: System, q, rank_tolerance) -> "Crossing":
+    def at(system: System, t, q, rank_tolerance) -> "Crossing":
         """At coordinates q, split in the identity metric."""
-        configuration = configure(system, q)
-        cuts = cut_frames(configuration)
-        rows = jacobian(cuts)
-        return Crossing(configuration, cuts, rows, invert(None, rows, system.coordinate_units, rank_tolerance))
+        configuration = configure(system, t, q)
+        rows = jacobian(configuration)
+        return Crossing(configuration, rows, invert(None, rows, system.units, rank_tolerance))
 
     def _outside(self, rows):
         """Rows of which the part that J reaches is taken off."""
         return rows - self.jacobian @ (self.inverse.normal @ rows)
 
     def _bias(self, v):
-        return bias(self.cuts, move(self.configuration, v))
+        return bias(move(self.configuration, v))
 
-    def off_branch(self, v) -> Float[Array, " m"]:
-        """The part of γ(v, v) outside the range of J: zero for speeds on a branch."""
-        return self._outside(self._bias(v))
+    def fastest(self, v):
+        """The largest of speeds, in radians and lengths of the mechanism."""
+        return jnp.max(jnp.abs(v / self.configuration.system.units), initial=0.0)
+
+    def off_branch(self, v, scale=1.0) -> Float[Array, " m"]:
+        """The part of γ(v, v) outside the range of J: zero for speeds on a branch.
+
+        `scale`: what the speeds v are to be multiplied by; that of γ is then its square.
+        """
+        return self._outside(self._bias(v) + self._driven(scale))
+
+    def _driven(self, scale):
+        return drive_acceleration(self.configuration.system, self.configuration.t) / scale**2
 
     def along(self, v) -> tuple[Float[Array, " m"], Int[Array, ""]]:
         """Along speeds v, of any size: how far they are from a branch, and the rank next to here.
@@ -55,12 +63,13 @@ class Crossing(eqx.Module):
         The first is `off_branch` of speeds of which the largest is one; the second, by first-order
         perturbation, rank(J) + rank(Uᵀ J̇ N) with U, N the null spaces of Jᵀ and J.
         """
-        fastest = jnp.max(jnp.abs(v / self.configuration.system.coordinate_units), initial=0.0)
-        direction = v / jnp.where(fastest > 0.0, fastest, 1.0)
+        fastest = self.fastest(v)
+        scale = jnp.where(fastest > 0.0, fastest, 1.0)
+        direction = v / scale
         # γ = −J̇ v is quadratic in v, so −J̇ w is a quarter of γ(v + w) − γ(v − w). All at once, to compile γ once.
         basis = self.inverse.basis
         speeds = jnp.concatenate([direction[:, None], direction[:, None] + basis, direction[:, None] - basis], axis=1)
         outside = self._outside(jax.vmap(self._bias, in_axes=1, out_axes=1)(speeds))
         plus, minus = jnp.split(outside[:, 1:], 2, axis=1)
         opening = jnp.abs(jnp.diagonal(pivoted_qr(0.25 * (plus - minus)).r))
-        return outside[:, 0], self.inverse.rank + jnp.sum(opening > OPENING)
+        return outside[:, 0] + self._outside(self._driven(scale)), self.inverse.rank + jnp.sum(opening > OPENING)

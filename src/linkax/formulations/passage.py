@@ -6,6 +6,7 @@ speeds and accelerations are smooth functions through the passage. So close to i
 interpolated between states before and behind it, where nothing is amplified.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox.internal as eqxi
@@ -50,7 +51,23 @@ class _Trip(NamedTuple):
     gap: Array
 
 
-def limit(function, powers, arguments, q, v, units):
+class Course(NamedTuple):
+    """A state on its way: where a step of REACH along the motion begins.
+
+    - `t` [s]; `q`, (n_q,); `v`, (n_v,). `units`: one unit of each speed.
+    - `retract`: (q, change (n_v,)) ↦ q.
+    - `advances`: whether time goes on with the motion, as it must where drives prescribe it.
+    """
+
+    t: Float[Array, ""]
+    q: Float[Array, " n_q"]
+    v: Float[Array, " n_v"]
+    units: Float[Array, " n_v"]
+    retract: Callable
+    advances: bool
+
+
+def limit(function, powers, arguments, course: Course):
     """Evaluate a function of the coordinates, close to a singular configuration as a limit along v.
 
     Costs one evaluation where d ≥ NEAR, and ten where it is smaller. One loop serves both, so
@@ -60,15 +77,16 @@ def limit(function, powers, arguments, q, v, units):
 
     **Arguments:**
 
-    - `function`: (arguments, q) ↦ `Value`; a function of the module, not a closure.
+    - `function`: (arguments, t, q) ↦ `Value`; a function of the module, not a closure.
     - `powers`: of a speed that each answer is of the order of: 0 for coordinates, 1 for speeds, 2.
-    - `q`, `v`: state, (n_v,). `units`: one unit of each coordinate.
 
     **Returns:** the answers, and d at the state itself. Differentiable in both modes.
     """
-    fastest = jnp.max(jnp.abs(v / units), initial=0.0)
+    t, q, v = course.t, course.q, course.v
+    fastest = jnp.max(jnp.abs(v / course.units), initial=0.0)
     # Where the neighbours lie has no influence on the limit, so it needs no derivative.
-    stride = lax.stop_gradient(v * (REACH / jnp.where(fastest > 0.0, fastest, 1.0)))
+    duration = lax.stop_gradient(jnp.where(fastest > 0.0, REACH / jnp.where(fastest > 0.0, fastest, 1.0), 0.0))
+    stride = lax.stop_gradient(v) * duration
     places, weights = jnp.asarray(PLACES, q.dtype), jnp.asarray(WEIGHTS, q.dtype)
 
     def unfinished(trip):
@@ -76,8 +94,9 @@ def limit(function, powers, arguments, q, v, units):
 
     def body(trip):
         first = trip.count == 0
-        at = jnp.where(trip.count == LAST, trip.sums[0][0], q + places[trip.count] * stride)
-        value = function(arguments, at)
+        place = places[trip.count]
+        at = jnp.where(trip.count == LAST, trip.sums[0][0], course.retract(q, place * stride))
+        value = function(arguments, t + place * duration if course.advances else t, at)
         weight = weights[:, trip.count]
         add = lambda total, answer: total + jnp.where(first, 0.0, jnp.multiply.outer(weight, answer))
         return _Trip(
@@ -88,7 +107,7 @@ def limit(function, powers, arguments, q, v, units):
             value.gap,
         )
 
-    shapes = jax.eval_shape(lambda q: function(arguments, q).answers, q)
+    shapes = jax.eval_shape(lambda q: function(arguments, t, q).answers, q)
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     pairs = jax.tree.map(lambda leaf: jnp.zeros((2, *leaf.shape), leaf.dtype), shapes)
     one = jnp.ones((), q.dtype)

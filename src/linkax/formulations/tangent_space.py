@@ -12,12 +12,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from linkax.equations.coordinates import on_manifold, retract, speeds
 from linkax.equations.dynamics import generalised_force, mass_matrix
-from linkax.equations.kinematics import configure, move
-from linkax.equations.loops import bias, cut_frames, jacobian, residual
+from linkax.equations.kinematics import Configuration, configure, move
+from linkax.equations.loops import gamma, is_driven, jacobian, rate, residual
 from linkax.equations.system import System
 from linkax.formulations.branches import Crossing
-from linkax.formulations.passage import Value, limit
+from linkax.formulations.passage import Course, Value, limit
 from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert, with_mass
 
 ROUNDING_ULPS = 8.0
@@ -40,18 +41,16 @@ class Dynamics(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """Loop rows and mass matrix at coordinates q."""
+    """Loop rows and mass matrix at a configuration."""
 
-    configuration: object
-    cuts: object
+    configuration: Configuration
     jacobian: Float[Array, "m n_v"]
     mass: Float[Array, "n_v n_v"]
 
 
-def _at(system, q) -> _Instant:
-    configuration = configure(system, q)
-    cuts = cut_frames(configuration)
-    return _Instant(configuration, cuts, jacobian(cuts), mass_matrix(configuration))
+def _at(system, t, q) -> _Instant:
+    configuration = configure(system, t, q)
+    return _Instant(configuration, jacobian(configuration), mass_matrix(configuration))
 
 
 def _largest(rows):
@@ -74,113 +73,120 @@ class TangentSpace(eqx.Module):
     metric: Literal["mass", "identity"] = eqx.field(static=True, default="mass")
     corrections: int = eqx.field(static=True, default=1)
 
-    def _weight(self, system: System, instant: _Instant):
+    def _weight(self, instant: _Instant):
         """W of the corrections."""
-        return instant.mass if self.metric == "mass" else jnp.diag(system.coordinate_units**-2)
+        if self.metric == "mass":
+            return instant.mass
+        return jnp.diag(instant.configuration.system.units**-2)
 
-    def _split(self, system: System, instant: _Instant) -> Inverse:
+    def _split(self, instant: _Instant) -> Inverse:
         weight = instant.mass if self.metric == "mass" else None
-        return invert(weight, instant.jacobian, system.coordinate_units, self.rank_tolerance, self.rank_nearby)
+        units = instant.configuration.system.units
+        return invert(weight, instant.jacobian, units, self.rank_tolerance, self.rank_nearby)
 
     def _solve(self, split, instant, f, gamma, sweeps):
         """v̇ and λ of M v̇ = f + Jᵀλ, J v̇ = γ."""
         inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
         return constrained_solve(inverse, instant.mass, instant.jacobian, f, gamma, sweeps)
 
-    def _acceleration(self, system, t, instant, v, split, sweeps):
+    def _acceleration(self, instant, v, split, sweeps):
         motion = move(instant.configuration, v)
-        return self._solve(split, instant, generalised_force(t, motion), bias(instant.cuts, motion), sweeps)[0]
+        return self._solve(split, instant, generalised_force(motion), gamma(motion), sweeps)[0]
 
-    def _on_velocity_level(self, system, instant, v, split, sweeps):
-        """The speeds nearest to v that satisfy J v = 0."""
-        weight = self._weight(system, instant)
-        rest = jnp.zeros(instant.jacobian.shape[0], v.dtype)
-        return constrained_solve(split, weight, instant.jacobian, weight @ v, rest, sweeps)[0]
+    def _on_velocity_level(self, instant, v, split, sweeps):
+        """The speeds nearest to v that satisfy J v = b."""
+        weight, configuration = self._weight(instant), instant.configuration
+        asked = rate(configuration.system, configuration.t)
+        return constrained_solve(split, weight, instant.jacobian, weight @ v, asked, sweeps)[0]
 
-    def _step(self, system, instant, split):
-        """The smallest correction of q that closes the linearised loops."""
-        weight = self._weight(system, instant)
+    def _step(self, instant, split, rows):
+        """The smallest change of q that takes `rows` off the linearised loops."""
+        weight = self._weight(instant)
         still = jnp.zeros(weight.shape[0], weight.dtype)
-        return constrained_solve(split, weight, instant.jacobian, still, -residual(instant.cuts), sweeps=0)[0]
+        return constrained_solve(split, weight, instant.jacobian, still, -rows, sweeps=0)[0]
 
-    def _corrected(self, system, q, v):
+    def _corrected(self, system, t, q, v):
         """One factorisation, at q; then a fixed number of corrections with it."""
-        instant = _at(system, q)
-        split = self._split(system, instant)
+        instant = _at(system, t, on_manifold(system.topology, q))
+        split = self._split(instant)
         first = instant
         for _ in range(self.corrections):
-            q = q + self._step(system, first._replace(cuts=instant.cuts), split)
-            instant = _at(system, q)
-        v = self._on_velocity_level(system, instant, v, split, sweeps=2)
-        return q, v, instant, split
+            step = self._step(first, split, residual(instant.configuration))
+            instant = _at(system, t, retract(system.topology, instant.configuration.q, step))
+        v = self._on_velocity_level(instant, v, split, sweeps=2)
+        return v, instant, split
 
-    def _limit(self, function, powers, details, system, q, v):
-        """A function of (method, system, v, details) and q at q, or as a limit along v."""
-        return limit(function, powers, (self, system, v, details), q, v, system.coordinate_units)
+    def _limit(self, function, powers, system, t, q, v):
+        """A function of (method, system, v), t and q at q, or as a limit along v."""
+        step = lambda q, change: retract(system.topology, q, change)
+        return limit(function, powers, (self, system, v), Course(t, q, v, system.units, step, is_driven(system)))
 
     @eqx.filter_jit  # traced once, however often a solver asks
-    def correct(self, system: System, q, v, errors=()):
+    def correct(self, system: System, t, q, v, errors=()):
         """q and v moved onto the manifold, for states close to it, and the distance d there.
 
         `errors`, arrays (n_v,), are estimates of errors of the state. Of them only the part in the
         tangent space remains in the state, and only that is returned.
         """
         if system.topology.num_rows == 0:
-            return q, v, errors, jnp.ones((), q.dtype)
-        q, v, instant, split = self._corrected(system, q, v)
+            return on_manifold(system.topology, q), v, errors, jnp.ones((), q.dtype)
+        v, instant, split = self._corrected(system, t, q, v)
         if errors:
-            remaining = split.tangent @ (self._weight(system, instant) @ jnp.stack(errors, axis=1))
+            remaining = split.tangent @ (self._weight(instant) @ jnp.stack(errors, axis=1))
             # The factors are those of the state before its correction.
             remaining = remaining - split.normal @ (instant.jacobian @ remaining)
             errors = tuple(remaining.T)
-        return q, v, errors, split.distance
+        return instant.configuration.q, v, errors, split.distance
 
     @eqx.filter_jit  # traced once, however often a solver asks
     def derivative(self, system: System, t, q, v, correct: bool):
-        """q̇ and v̇ at (q, v), corrected before the equations of motion are formed, and d there."""
+        """v and v̇ at (t, q, v), corrected before the equations of motion are formed, q and d there."""
         if correct and system.topology.num_rows > 0:
-            q, v, instant, split = self._corrected(system, q, v)
-            return v, self._acceleration(system, t, instant, v, split, sweeps=2), split.distance
-        instant = _at(system, q)
-        split = self._split(system, instant)
-        return v, self._acceleration(system, t, instant, v, split, sweeps=1), split.distance
+            v, instant, split = self._corrected(system, t, q, v)
+            acceleration = self._acceleration(instant, v, split, sweeps=2)
+        else:
+            instant = _at(system, t, q)
+            split = self._split(instant)
+            acceleration = self._acceleration(instant, v, split, sweeps=1)
+        return v, acceleration, instant.configuration.q, split.distance
 
-    def crossing(self, system: System, q) -> Crossing:
+    def crossing(self, system: System, t, q) -> Crossing:
         """The configuration as a crossing of branches."""
-        instant = _at(system, q)
-        return Crossing(instant.configuration, instant.cuts, instant.jacobian, self._split(system, instant))
+        instant = _at(system, t, q)
+        return Crossing(instant.configuration, instant.jacobian, self._split(instant))
 
     def departure(self, system: System, t, q):
         """The configuration as a crossing of branches, and v̇ at rest there."""
-        instant = _at(system, q)
-        split, rest = self._split(system, instant), jnp.zeros(system.topology.num_coordinates, system.dtype)
+        instant = _at(system, t, q)
+        split, rest = self._split(instant), jnp.zeros(system.topology.num_speeds, system.dtype)
         inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
-        acceleration = inverse.tangent @ generalised_force(t, move(instant.configuration, rest))
-        return Crossing(instant.configuration, instant.cuts, instant.jacobian, split), acceleration
+        motion = move(instant.configuration, rest)
+        acceleration = inverse.tangent @ generalised_force(motion) + inverse.normal @ gamma(motion)
+        return Crossing(instant.configuration, instant.jacobian, split), acceleration
 
     @eqx.filter_jit
     def dynamics(self, system: System, t, q, v) -> Dynamics:
         """Accelerations and multipliers at a state on the manifold."""
-        instant = _at(system, q)
-        split = self._split(system, instant)
+        instant = _at(system, t, q)
+        split = self._split(instant)
         motion = move(instant.configuration, v)
-        force, gamma = generalised_force(t, motion), bias(instant.cuts, motion)
+        force, right = generalised_force(motion), gamma(motion)
         if system.topology.num_rows == 0:
-            acceleration, multipliers = self._solve(split, instant, force, gamma, sweeps=1)
+            acceleration, multipliers = self._solve(split, instant, force, right, sweeps=1)
         else:
-            (_, acceleration), _ = self._limit(_acceleration_at, (0, 2), t, system, q, v)
+            (_, acceleration), _ = self._limit(_acceleration_at, (0, 2), system, t, q, v)
             _, multipliers = self._solve(split, instant, force, instant.jacobian @ acceleration, sweeps=1)
-        violation = instant.jacobian @ acceleration - gamma
+        violation = instant.jacobian @ acceleration - right
         return Dynamics(acceleration, multipliers, split.rank, split.distance, violation)
 
     @eqx.filter_jit
-    def close(self, system: System, q, v):
+    def close(self, system: System, t, q, v):
         """q and v on the manifold to rounding, from any state near it, with fresh factors."""
         if system.topology.num_rows == 0:
-            return q, v
-        return _close((self, system, q, v))
+            return on_manifold(system.topology, q), v
+        return _close((self, system, t, q, v))
 
-    def _approach(self, system, q, v):
+    def _approach(self, system, t, q, v):
         """Newton steps on q until the loops close to rounding or stop closing further, then v."""
         small = ROUNDING_ULPS * jnp.finfo(q.dtype).eps
 
@@ -190,46 +196,54 @@ class TangentSpace(eqx.Module):
 
         def improve(carry):
             count, q, _, _, before, _ = carry
-            instant = _at(system, q)
-            split = self._split(system, instant)
-            gap = _largest(residual(instant.cuts))
+            instant = _at(system, t, q)
+            split, rows = self._split(instant), residual(instant.configuration)
+            gap = _largest(rows)
             done = (gap <= small) | (gap >= before)
-            closer = jnp.where(done, q, q + self._step(system, instant, split))
-            speeds = self._on_velocity_level(system, instant, v, split, sweeps=1)
-            return count + 1, closer, speeds, split.distance, gap, before
+            closer = retract(system.topology, q, self._step(instant, split, rows))
+            speeds = self._on_velocity_level(instant, v, split, sweeps=1)
+            return count + 1, jnp.where(done, q, closer), speeds, split.distance, gap, before
 
         far, one = jnp.asarray(jnp.finfo(q.dtype).max, q.dtype), jnp.ones((), q.dtype)
-        _, q, v, distance, _, _ = lax.while_loop(unfinished, improve, (jnp.zeros((), int), q, v, one, far, 2.0 * far))
+        begin = (jnp.zeros((), int), on_manifold(system.topology, q), v, one, far, 2.0 * far)
+        _, q, v, distance, _, _ = lax.while_loop(unfinished, improve, begin)
         return q, v, distance
 
-    def _last_step(self, system, closed, q, v):
+    def _last_step(self, system, t, closed, q, v):
         """What `close` does near a closed state, as a function to be differentiated."""
-        instant = _at(system, closed)
-        split, weight = self._split(system, instant), self._weight(system, instant)
-        away = weight @ (q - closed)
-        q = closed + constrained_solve(split, weight, instant.jacobian, away, -residual(instant.cuts))[0]
-        instant = _at(system, q)
-        return q, self._on_velocity_level(system, instant, v, split, sweeps=2)
+        instant = _at(system, t, closed)
+        split, weight = self._split(instant), self._weight(instant)
+        away = weight @ speeds(system.topology, closed, q - closed)
+        rows = residual(instant.configuration)
+        q = retract(system.topology, closed, constrained_solve(split, weight, instant.jacobian, away, -rows)[0])
+        instant = _at(system, t, q)
+        return q, self._on_velocity_level(instant, v, split, sweeps=2)
 
 
-def _acceleration_at(arguments, q) -> Value:
-    method, system, v, t = arguments
-    gap = _largest(residual(cut_frames(configure(system, q))))
-    q, v, instant, split = method._corrected(system, q, v)
-    return Value((q, method._acceleration(system, t, instant, v, split, sweeps=2)), split.distance, gap)
+def _gap(system, t, q):
+    return _largest(residual(configure(system, t, q)))
 
 
-def _closed_state(arguments, q) -> Value:
-    method, system, v, _ = arguments
-    gap = _largest(residual(cut_frames(configure(system, q))))
-    q, v, distance = method._approach(system, q, v)
+def _acceleration_at(arguments, t, q) -> Value:
+    method, system, v = arguments
+    gap = _gap(system, t, q)
+    v, instant, split = method._corrected(system, t, q, v)
+    answers = instant.configuration.q, method._acceleration(instant, v, split, sweeps=2)
+    return Value(answers, split.distance, gap)
+
+
+def _closed_state(arguments, t, q) -> Value:
+    method, system, v = arguments
+    gap = _gap(system, t, q)
+    q, v, distance = method._approach(system, t, q, v)
     return Value((q, v), distance, gap)
 
 
 @eqx.filter_custom_jvp
 def _close(arguments):
-    method, system, q, v = arguments
-    return method._limit(_closed_state, (0, 1), None, system, q, v)[0]
+    method, system, t, q, v = arguments
+    (q, v), _ = method._limit(_closed_state, (0, 1), system, t, q, v)
+    return on_manifold(system.topology, q), v
 
 
 @_close.def_jvp
@@ -239,7 +253,7 @@ def _close_jvp(primals, tangents):
     closed = _close(arguments)
 
     def last_step(arguments):
-        method, system, q, v = arguments
-        return method._last_step(system, closed[0], q, v)
+        method, system, t, q, v = arguments
+        return method._last_step(system, t, closed[0], q, v)
 
     return closed, eqx.filter_jvp(last_step, (arguments,), (tangent,))[1]

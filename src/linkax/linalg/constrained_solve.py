@@ -45,7 +45,8 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     - `units`: one unit of each speed, (n,), so that radians and metres compare.
     - `tolerance`: τ; a row is independent where |R_kk| > τ max(|R₁₁|, 1).
     - `rank_nearby`: the rank at the states around, where it is known; it is larger than the rank
-      of a J that is singular.
+      of a J that is singular. No more rows than that are taken for independent: off the loops,
+      rows that the loops make dependent differ by as much as the loops are open.
     """
     weight, jacobian, units = lax.stop_gradient((weight, jacobian, units))
     rows, n = jacobian.shape
@@ -70,6 +71,8 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     count = min(n, rows)
     diagonal = jnp.abs(jnp.diagonal(r))
     active = diagonal > tolerance * jnp.maximum(diagonal[0], 1.0)
+    if rank_nearby is not None:
+        active = active & (jnp.arange(count) < rank_nearby)
     identity = jnp.eye(count, dtype=dtype)
     triangle = jnp.where(active[:, None] & active[None, :], r[:, :count][:count], identity)
     # Undo the permutation and the scale of the rows, and the units of the speeds.

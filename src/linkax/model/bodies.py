@@ -103,6 +103,17 @@ class RigidBody(eqx.Module):
         return Frame(self.name, offset, rotation_matrix(rotation, f"rotation of a frame on body {self.name!r}"))
 
 
+def frame_of(place, what) -> Frame:
+    """The frame that a user means by a body, `body.at(...)`, or the ground; `what` names it in errors."""
+    if isinstance(place, Ground):
+        return GROUND.at([0.0, 0.0, 0.0])
+    if isinstance(place, RigidBody):
+        return place.at([0.0, 0.0, 0.0])
+    if isinstance(place, Frame):
+        return place
+    raise ValueError(f"{what} is {place!r}; give a body, body.at(...), or lx.GROUND")
+
+
 def _inertia_tensor(inertia, what):
     diagonal = np.ndim(value(inertia)) == 1 if not hasattr(inertia, "shape") else len(inertia.shape) == 1
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)

@@ -1,14 +1,17 @@
 """Force elements: what acts on a mechanism besides its joints."""
 
 import abc
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import number
+from linkax.model.bodies import Frame, frame_of
+from linkax.model.functions import Law, evaluated, number_or_law
+from linkax.model.numbers import number, require
+from linkax.model.terms import Term, term
+from linkax.spatial.rotations import dot
 
 
 class Load(NamedTuple):
@@ -26,20 +29,45 @@ class Load(NamedTuple):
     @staticmethod
     def none(system) -> "Load":
         vectors = jnp.zeros((system.topology.num_bodies, 3), system.dtype)
-        return Load(vectors, vectors, jnp.zeros(system.topology.num_coordinates, system.dtype))
+        return Load(vectors, vectors, jnp.zeros(system.topology.num_speeds, system.dtype))
+
+    def plus(self, other: "Load") -> "Load":
+        """Both together."""
+        return Load(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 class AbstractForce(eqx.Module):
-    """A force element; a user's own is a subclass.
+    """A force element; a user's own is a subclass with a `load`.
 
-    `motion` is a `linkax.equations.Motion`, all bodies' poses and twists at one instant, and
-    `motion.system` the mechanism's numbers in the order of its bodies.
+    `motion` is a `linkax.Motion`: where all bodies are and how they move at one instant, and how
+    loads on points and along joints are made. `motion.system` has the mechanism's numbers in the
+    order of its bodies. Numbers that are fields are traced.
     """
 
     @property
-    def joints(self) -> tuple[str, ...]:
-        """Joints whose coordinate this element acts along; they go into the spanning tree."""
+    def terms(self) -> tuple[Term, ...]:
+        """Joints that this element acts along; they go into the spanning tree where they can."""
         return ()
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """Frames that this element attaches to."""
+        return ()
+
+    @property
+    def needs_coordinate(self) -> bool:
+        """Whether it reads the coordinates of its joints, and not their speeds alone."""
+        return False
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints of `terms`."""
+        return tuple(dict.fromkeys(along.joint for along in self.terms))
+
+    @property
+    def described(self) -> str:
+        """What errors call it."""
+        return _described(type(self).__name__, [repr(name) for name in self.joints] or _named(self.frames))
 
     @abc.abstractmethod
     def load(self, t, motion) -> Load:
@@ -48,6 +76,14 @@ class AbstractForce(eqx.Module):
     def potential_energy(self, configuration):
         """Potential energy [J]; zero for an element that has none."""
         return jnp.zeros((), configuration.system.dtype)
+
+
+def _described(kind, of):
+    return f"{kind} on {' and '.join(of)}" if of else kind
+
+
+def _named(frames):
+    return [f"body {frame.body!r}" for frame in frames]
 
 
 class Gravity(AbstractForce):
@@ -67,28 +103,217 @@ class Gravity(AbstractForce):
         return -jnp.sum(weights * configuration.world_center_of_mass())
 
 
-class JointTorque(AbstractForce):
-    """A constant torque [N m], or force [N] on a slide, along a joint with one coordinate.
+class _AlongJoint(AbstractForce):
+    """A torque, or a force on a slide, along one speed of a joint, and its opposite on the parent."""
 
-    It acts on the child, and its opposite on the parent.
-    """
-
-    joint: str = eqx.field(static=True)
-    torque: Float[Array, ""]
-
-    def __init__(self, joint: str, torque):
-        if not isinstance(joint, str):
-            raise ValueError(f"JointTorque: joint is {joint!r}; give the name of a joint")
-        self.joint = joint
-        self.torque = number(torque, (), f"JointTorque on {joint!r}: torque [N m or N]")
+    joint: Term = eqx.field(static=True)
 
     @property
-    def joints(self):
+    def terms(self):
         return (self.joint,)
 
+    @abc.abstractmethod
+    def torque_at(self, t, motion) -> Float[Array, ""]:
+        """Along the joint, on the child [N m or N]."""
+
     def load(self, t, motion):
-        topology = motion.system.topology
-        along = np.zeros(topology.num_coordinates)
-        along[topology.coordinates[self.joint]] = 1.0
-        none = Load.none(motion.system)
-        return none._replace(joint_force=self.torque * jnp.asarray(along, motion.system.dtype))
+        return motion.joint_load(self.joint, self.torque_at(t, motion))
+
+
+class JointTorque(_AlongJoint):
+    """A torque [N m], or force [N] on a slide, along a joint; on the child, and its opposite on the parent.
+
+    **Arguments:**
+
+    - `joint`: a joint's name, or (name, index) for one of several speeds.
+    - `torque`: a number, or a function (t, motion) ↦ number; what `motion` tells is in
+      `linkax.Motion`. Numbers of the function to be traced go in by
+      `jax.tree_util.Partial(function, numbers)` or an `equinox.Module`.
+    """
+
+    torque: Float[Array, ""] | Law
+
+    def __init__(self, joint, torque):
+        self.joint = term(joint, "JointTorque")
+        self.torque = number_or_law(torque, (), f"JointTorque on {self.joint.joint!r}: torque [N m or N]")
+
+    def torque_at(self, t, motion):
+        return evaluated(self.torque, t, motion)
+
+
+class JointSpring(_AlongJoint):
+    """A linear spring along a joint: −stiffness × (coordinate − free).
+
+    At a joint that is cut (where all joints of a loop have springs, say) the angle is read in
+    (−π, π] from `free`: the spring forgets whole turns.
+
+    **Arguments:** `joint`: a name, or (name, index); `stiffness` [N m/rad or N/m]; `free`: the
+    coordinate at which it is unstrained [rad or m].
+    """
+
+    stiffness: Float[Array, ""]
+    free: Float[Array, ""]
+
+    def __init__(self, joint, stiffness, free=0.0):
+        self.joint = term(joint, "JointSpring")
+        what = f"JointSpring on {self.joint.joint!r}"
+        self.stiffness = number(stiffness, (), f"{what}: stiffness [N m/rad or N/m]")
+        self.free = number(free, (), f"{what}: free [rad or m]")
+
+    @property
+    def needs_coordinate(self):
+        return True
+
+    def torque_at(self, t, motion):
+        return -self.stiffness * motion.configuration.joint_displacement(self.joint, self.free)
+
+    def potential_energy(self, configuration):
+        return self.stiffness * configuration.joint_displacement(self.joint, self.free) ** 2 / 2.0
+
+
+class JointDamper(_AlongJoint):
+    """Viscous damping along a joint: −damping × speed, `damping` in N m s/rad or N s/m."""
+
+    damping: Float[Array, ""]
+
+    def __init__(self, joint, damping):
+        self.joint = term(joint, "JointDamper")
+        self.damping = number(damping, (), f"JointDamper on {self.joint.joint!r}: damping [N m s/rad or N s/m]")
+
+    def torque_at(self, t, motion):
+        return -self.damping * motion.joint_rate(self.joint)
+
+
+class JointFriction(_AlongJoint):
+    """Coulomb friction along a joint, regularised: −torque × tanh(speed / scale).
+
+    Below `scale` [rad/s or m/s] it is nearly viscous, so that a joint at rest under a load creeps;
+    at three scales it has 99.5 % of `torque` [N m or N]. The smaller the scale, the stiffer.
+
+    **Raises:** `ValueError` for a negative torque, or a scale that is not positive.
+    """
+
+    torque: Float[Array, ""]
+    scale: Float[Array, ""]
+
+    def __init__(self, joint, torque, scale):
+        self.joint = term(joint, "JointFriction")
+        what = f"JointFriction on {self.joint.joint!r}"
+        torque_of = f"{what}: torque [N m or N]"
+        self.torque = require(number(torque, (), torque_of), lambda x: x >= 0.0, torque_of, "it must be zero or more")
+        scale_of = f"{what}: scale [rad/s or m/s]"
+        self.scale = require(number(scale, (), scale_of), lambda x: x > 0.0, scale_of, "it must be positive")
+
+    def torque_at(self, t, motion):
+        return -self.torque * jnp.tanh(motion.joint_rate(self.joint) / self.scale)
+
+
+class _BetweenPoints(AbstractForce):
+    """A force along the line between the origins of two frames."""
+
+    first: Frame
+    second: Frame
+
+    @property
+    def frames(self):
+        return (self.first, self.second)
+
+    @abc.abstractmethod
+    def pull(self, motion) -> Float[Array, "3"]:
+        """The force on the first point; its opposite acts on the second [N]."""
+
+    def load(self, t, motion):
+        force = self.pull(motion)
+        return motion.point_load(self.first, force).plus(motion.point_load(self.second, -force))
+
+
+def _unit(vector):
+    """The direction of a vector; zero for none."""
+    square = dot(vector, vector)
+    return jnp.where(square > 0.0, vector / jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
+
+
+class Spring(_BetweenPoints):
+    """A linear spring between two points; it pulls with stiffness × (distance − free_length).
+
+    Where the points meet it has no direction, and a free length pushes nowhere.
+
+    **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`;
+    `stiffness` [N/m]; `free_length` [m], zero or more.
+    """
+
+    stiffness: Float[Array, ""]
+    free_length: Float[Array, ""]
+
+    def __init__(self, first, second, stiffness, free_length=0.0):
+        self.first, self.second = _frames("Spring", first, second)
+        self.stiffness = number(stiffness, (), f"{self.described}: stiffness [N/m]")
+        what = f"{self.described}: free_length [m]"
+        length = number(free_length, (), what)
+        self.free_length = require(length, lambda metres: metres >= 0.0, what, "it must be zero or more")
+
+    def pull(self, motion):
+        along = motion.configuration.between(self.first, self.second)
+        return self.stiffness * (along - self.free_length * _unit(along))
+
+    def potential_energy(self, configuration):
+        along = configuration.between(self.first, self.second)
+        stretch = dot(along, _unit(along)) - self.free_length
+        return self.stiffness * stretch**2 / 2.0
+
+
+class Damper(_BetweenPoints):
+    """Viscous damping between two points: pulls with `damping` [N s/m] × the rate of their distance.
+
+    `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
+    """
+
+    damping: Float[Array, ""]
+
+    def __init__(self, first, second, damping):
+        self.first, self.second = _frames("Damper", first, second)
+        self.damping = number(damping, (), f"{self.described}: damping [N s/m]")
+
+    def pull(self, motion):
+        direction = _unit(motion.configuration.between(self.first, self.second))
+        rate = dot(motion.point_velocity(self.second) - motion.point_velocity(self.first), direction)
+        return self.damping * rate * direction
+
+
+class PointForce(AbstractForce):
+    """A force on a point of a body.
+
+    **Arguments:**
+
+    - `point`: a body (its reference frame), or `body.at(...)`.
+    - `force`: three numbers [N], or a function (t, motion) ↦ three numbers; see `JointTorque`.
+    - `axes`: "ground" (default), or "frame": those of the frame at the point, which turn with it.
+    """
+
+    point: Frame
+    force: Float[Array, "3"] | Law
+    axes: Literal["ground", "frame"] = eqx.field(static=True)
+
+    def __init__(self, point, force, axes="ground"):
+        self.point = frame_of(point, "PointForce: point")
+        self.force = number_or_law(force, (3,), f"{self.described}: force [N]")
+        if axes not in ("ground", "frame"):
+            raise ValueError(f"{self.described}: axes is {axes!r}; known: 'ground', 'frame'")
+        self.axes = axes
+
+    @property
+    def frames(self):
+        return (self.point,)
+
+    def load(self, t, motion):
+        force = evaluated(self.force, t, motion)
+        if self.axes == "frame":
+            force = motion.configuration.axes(self.point) @ force
+        return motion.point_load(self.point, force)
+
+
+def _frames(kind, first, second):
+    first, second = frame_of(first, f"{kind}: first point"), frame_of(second, f"{kind}: second point")
+    if first.body == second.body:
+        raise ValueError(f"{_described(kind, _named([first]))}: both points are on it; give points on two bodies")
+    return first, second

@@ -1,24 +1,30 @@
-"""A mechanism: bodies, joints and forces, checked, with its spanning tree."""
+"""A mechanism: bodies, joints, constraints and forces, checked, with its spanning tree."""
 
 from collections import Counter
 
 import equinox as eqx
 
 from linkax.model.bodies import GROUND_NAME, RigidBody
+from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
 from linkax.model.immobile_rows import split_rows
+from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
 
 
 class Mechanism(eqx.Module):
-    """Bodies held together by joints, with the forces on them.
+    """Bodies held together by joints, with the constraints and the forces on them.
 
     The spanning tree and the cut joints are found here, in any order of the joints: breadth
-    first from ground, joints that carry a force element first. `print(mechanism.topology.describe())`
-    shows the choice; `cut=True` on a joint forces it. Bodies and joints are kept in tree order.
+    first from ground, joints that carry a constraint or a force element first.
+    `print(mechanism.topology.describe())` shows the choice; `cut=True` on a joint forces it. Bodies
+    and joints are kept in tree order.
 
-    **Arguments:** `bodies`, `joints`, `forces`: sequences, names unique among bodies and among joints.
+    **Arguments:**
+
+    - `bodies`, `joints`, `forces`: sequences; names unique among bodies and among joints.
+    - `constraints`: `Coupling`, `Drive` and `Distance`; names unique among joints and constraints.
 
     **Raises:** `ValueError` naming the element: a duplicate or unknown name, a body that no
     joint connects to ground, a joint with `cut=True` that closes no loop.
@@ -27,23 +33,33 @@ class Mechanism(eqx.Module):
     bodies: tuple[RigidBody, ...]
     joints: tuple[AbstractJoint, ...]
     forces: tuple[AbstractForce, ...]
+    constraints: tuple[AbstractConstraint, ...]
     topology: Topology = eqx.field(static=True)
 
-    def __init__(self, bodies, joints, forces=()):
-        bodies, joints = _checked(bodies, RigidBody, "bodies"), _checked(joints, AbstractJoint, "joints")
-        forces = _checked(forces, AbstractForce, "forces")
-        by_name = _by_name(bodies, "body")
-        _check_references(by_name, _by_name(joints, "joint"), forces)
-        driven = {name for force in forces for name in force.joints}
-        order, carriers, predecessors, cuts = spanning_tree(list(by_name), joints, driven)
-        for name in driven & {joint.name for joint in cuts}:
+    def __init__(self, bodies, joints, forces=(), constraints=()):
+        constraints = _checked(
+            constraints, (AbstractConstraint, Distance), "constraints", "Coupling, Drive or Distance"
+        )
+        joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
+        constraints = [c for c in constraints if not isinstance(c, Distance)]
+        bodies, joints = _checked(bodies, RigidBody, "bodies"), _checked(joints, AbstractJoint, "joints", "Joint")
+        forces = _checked(forces, AbstractForce, "forces", "Force")
+        by_name, joint_by_name = _by_name(bodies, "body"), _by_name(joints, "joint")
+        _by_name([*joints, *constraints], "joint or constraint")
+        _check_references(by_name, joint_by_name, constraints, forces)
+        related = {name for constraint in constraints for name in constraint.joints}
+        acted_on = {name for force in forces for name in force.joints}
+        order, carriers, predecessors, cuts = spanning_tree(list(by_name), joints, [related, acted_on])
+        for name in related & {joint.name for joint in cuts}:
+            of_joint = ", ".join(repr(c.name) for c in constraints if name in c.joints)
             raise ValueError(
-                f"a force element acts along joint {name!r}, which is cut; remove cut=True, or the force "
-                "elements along the other joints of its loop"
+                f"constraint {of_joint} relates joint {name!r}, which is cut, and whose angle therefore does not count "
+                "turns; remove cut=True, or relate fewer joints of this loop"
             )
         self.bodies = tuple(by_name[name] for name in order)
         self.joints = (*carriers, *cuts)
         self.forces = tuple(forces)
+        self.constraints = tuple(constraints)
         index = {GROUND_NAME: GROUND_INDEX} | {name: position for position, name in enumerate(order)}
         self.topology = Topology(
             bodies=tuple(order),
@@ -53,6 +69,7 @@ class Mechanism(eqx.Module):
             child=tuple(index[joint.child.body] for joint in self.joints),
             joint_types=tuple(type(joint) for joint in self.joints),
             **split_rows(carriers, predecessors, cuts),
+            constraints=tuple(constraint.name for constraint in constraints),
         )
 
     def body(self, name: str) -> RigidBody:
@@ -70,11 +87,11 @@ def _find(name, names, what):
     return names.index(name)
 
 
-def _checked(elements, kind, what):
+def _checked(elements, kind, what, called=None):
     elements = list(elements)
     for element in elements:
         if not isinstance(element, kind):
-            raise ValueError(f"{what} holds {element!r}, which is no {kind.__name__.removeprefix('Abstract')}")
+            raise ValueError(f"{what} holds {element!r}, which is no {called or kind.__name__}")
     return elements
 
 
@@ -85,19 +102,36 @@ def _by_name(elements, what):
     return {element.name: element for element in elements}
 
 
-def _check_references(bodies, joints, forces):
-    for joint in joints.values():
-        for frame in (joint.parent, joint.child):
+def _check_references(bodies, joints, constraints, forces):
+    def check_frames(what, frames):
+        for frame in frames:
             if frame.body not in bodies and frame.body != GROUND_NAME:
-                raise ValueError(
-                    f"joint {joint.name!r} attaches to body {frame.body!r}, which is not in bodies; add it there"
-                )
+                raise ValueError(f"{what} attaches to body {frame.body!r}, which is not in bodies; add it there")
+
+    def check_joint(what, name):
+        if name not in joints:
+            raise ValueError(f"{what} acts along unknown joint {name!r}; known: {', '.join(map(repr, joints))}")
+
+    for joint in joints.values():
+        check_frames(f"joint {joint.name!r}", (joint.parent, joint.child))
     for force in forces:
-        for name in force.joints:
-            kind = type(force).__name__
-            if name not in joints:
-                raise ValueError(f"{kind} acts along unknown joint {name!r}; known: {', '.join(map(repr, joints))}")
-            if joints[name].num_coordinates != 1:
-                raise ValueError(
-                    f"{kind} acts along joint {name!r}, which has {joints[name].num_coordinates} coordinates, not one"
-                )
+        check_frames(force.described, force.frames)
+        for name, index in force.terms:
+            check_joint(force.described, name)
+            _check_index(force.described, joints[name], index, force.needs_coordinate)
+    for constraint in constraints:
+        for name, index in constraint.terms:
+            check_joint(constraint.described, name)
+            _check_index(constraint.described, joints[name], index, True)
+
+
+def _check_index(what, joint, index, needs_coordinate):
+    """Whether a joint has a speed of that index, and if need be a coordinate whose rate it is."""
+    count = len(joint.speed_units)
+    kind = f"joint {joint.name!r}, a {type(joint).__name__}"
+    if index is None and count != 1:
+        raise ValueError(f"{what} acts along {kind}, which has {count} speeds, not one; give ({joint.name!r}, index)")
+    if not 0 <= (index or 0) < count:
+        raise ValueError(f"{what} acts along speed {index} of {kind}, which has {count}; they are counted from 0")
+    if needs_coordinate and joint.has_quaternion and (index or 0) < 3:
+        raise ValueError(f"{what} acts along coordinate {index} of {kind}, which is part of a quaternion; use another")

@@ -80,6 +80,19 @@ def unit_axis(axis, what: str):
     return Constant(vector / length) if isinstance(vector, np.ndarray) else vector / length
 
 
+def perpendicular_axis(axis, first, what: str):
+    """A unit vector like `unit_axis`, checked to be at a right angle to another."""
+    second = unit_axis(axis, what)
+    if isinstance(second, Constant) and isinstance(first, Constant):
+        cosine = float(second.array @ first.array)
+        if abs(cosine) > 1e-12:
+            raise ValueError(
+                f"{what} is {second.array.tolist()}, at {np.degrees(np.arccos(cosine)):.6g} degrees to the first axis "
+                f"{first.array.tolist()}; it must be at a right angle to it"
+            )
+    return second
+
+
 def rotation_matrix(rotation, what: str):
     """A rotation: None (identity) and numbers are structure, a JAX array is traced."""
     if rotation is None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.joints.joint import AbstractJoint
+from linkax.model.terms import Term
 
 GROUND_INDEX = -1
 
@@ -26,6 +27,10 @@ class Topology:
       (cut joint, i) of each loop row h₁ⁱ·s; cut joints and axes counted from 0. Rows that
       vanish identically are left out here, and kept in `immobile_rotation_rows` and
       `immobile_translation_rows`.
+    - `constraints`: names of the constraints on coordinates of the tree, a row each.
+
+    Rows of the loop constraints: rotation rows, translation rows, a combined row for each cut
+    joint whose type has one, and those of `constraints`.
     """
 
     bodies: tuple[str, ...]
@@ -38,6 +43,7 @@ class Topology:
     translation_rows: tuple[tuple[int, int], ...]
     immobile_rotation_rows: tuple[tuple[int, int, int], ...]
     immobile_translation_rows: tuple[tuple[int, int], ...]
+    constraints: tuple[str, ...] = ()
 
     @property
     def num_bodies(self) -> int:
@@ -49,32 +55,74 @@ class Topology:
 
     @property
     def num_rows(self) -> int:
-        return len(self.rotation_rows) + len(self.translation_rows)
+        plain = len(self.rotation_rows) + len(self.translation_rows)
+        return plain + len(self.combining) + len(self.constraints)
+
+    @cached_property
+    def combining(self) -> tuple[int, ...]:
+        """The cut joints with a combined row, counted from 0."""
+        kinds = self.joint_types[self.num_bodies :]
+        return tuple(i for i, kind in enumerate(kinds) if kind.combined_rotations or kind.combined_translations)
 
     @cached_property
     def coordinates(self) -> dict[str, slice]:
-        """The coordinates of each tree joint in q, and its speeds in v."""
+        """The coordinates of each tree joint in q."""
+        return self._slices(lambda kind: len(kind.speed_units) + kind.has_quaternion)
+
+    @cached_property
+    def speeds(self) -> dict[str, slice]:
+        """The speeds of each tree joint in v."""
+        return self._slices(lambda kind: len(kind.speed_units))
+
+    def _slices(self, count):
         slices, start = {}, 0
         for name, kind in zip(self.joints[: self.num_bodies], self.joint_types, strict=False):
-            slices[name] = slice(start, start + len(kind.coordinate_units))
+            slices[name] = slice(start, start + count(kind))
             start = slices[name].stop
         return slices
+
+    def column(self, term: Term) -> int:
+        """Where in v the speed of a term lies, of a joint in the tree."""
+        return self.speeds[term.joint].start + (term.index or 0)
 
     @cached_property
     def column_body(self) -> np.ndarray:
         """The body that each speed moves directly, shape (n_v,)."""
-        counts = [len(kind.coordinate_units) for kind in self.joint_types[: self.num_bodies]]
+        counts = [len(kind.speed_units) for kind in self.joint_types[: self.num_bodies]]
         return np.repeat(np.arange(self.num_bodies), counts)
 
     @property
-    def num_coordinates(self) -> int:
+    def num_speeds(self) -> int:
+        """n_v."""
         return len(self.column_body)
+
+    @property
+    def num_coordinates(self) -> int:
+        """n_q: the speeds, and one more for each quaternion."""
+        return self.num_speeds + len(self.quaternions)
+
+    @cached_property
+    def quaternions(self) -> np.ndarray:
+        """Where in q each quaternion lies, and where in v its angular velocity begins, (n, 2)."""
+        kinds = zip(self.joints[: self.num_bodies], self.joint_types, strict=False)
+        starts = [
+            (self.coordinates[name].start, self.speeds[name].start) for name, kind in kinds if kind.has_quaternion
+        ]
+        return np.array(starts, dtype=int).reshape(-1, 2)
+
+    @cached_property
+    def plain(self) -> np.ndarray:
+        """Where in q and in v the coordinates lie whose rates are speeds, (n, 2)."""
+        q, v = np.arange(self.num_coordinates), np.arange(self.num_speeds)
+        turning = self.quaternions[:, None, :]
+        in_q, in_v = turning[..., 0] + np.arange(4), turning[..., 1] + np.arange(3)
+        return np.stack([np.setdiff1d(q, in_q), np.setdiff1d(v, in_v)], axis=-1)
 
     @cached_property
     def slides(self) -> np.ndarray:
-        """Which coordinates are lengths [m], shape (n_q,)."""
+        """Which speeds are of lengths [m/s], shape (n_v,)."""
         kinds = self.joint_types[: self.num_bodies]
-        return np.array([unit == "m" for kind in kinds for unit in kind.coordinate_units], dtype=bool)
+        return np.array([unit == "m" for kind in kinds for unit in kind.speed_units], dtype=bool)
 
     @cached_property
     def reversed(self) -> np.ndarray:
@@ -120,8 +168,10 @@ class Topology:
         return "\n".join(lines)
 
 
-def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: set[str]):
-    """Choose the tree: breadth first from ground, joints named in `first` before all others.
+def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: list[set[str]]):
+    """Choose the tree: joints named in the sets of `first`, in their order, then breadth first from ground.
+
+    Joints of types that cannot carry a body are cut always.
 
     **Returns:** the names of the bodies from ground outwards, the tree joint and the
     predecessor of each, and the cut joints.
@@ -129,7 +179,7 @@ def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: set[str
     **Raises:** `ValueError` for a body that no joint connects to ground, and for a joint with
     `cut=True` that closes no loop.
     """
-    ranked = _by_rank([joint for joint in joints if not joint.cut], first)
+    ranked = _by_rank([joint for joint in joints if joint.can_carry and not joint.cut], first)
     cluster = {name: name for name in [GROUND_NAME, *bodies]}
 
     def find(name):
@@ -164,10 +214,10 @@ def _neighbours(joints):
 
 
 def _by_rank(joints, first):
-    """Those named in `first`, then those of the breadth-first tree, then the rest."""
+    """Those named in the sets of `first`, then those of the breadth-first tree, then the rest."""
     _, carriers, _ = _from_ground(joints)
-    nearest = {joint.name for joint in carriers}
-    return sorted(joints, key=lambda joint: (joint.name not in first, joint.name not in nearest))
+    sets = [*first, {joint.name for joint in carriers}]
+    return sorted(joints, key=lambda joint: [joint.name not in names for names in sets])
 
 
 def _from_ground(joints):

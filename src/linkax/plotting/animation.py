@@ -2,9 +2,11 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -12,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from PIL import Image
 
+from linkax.equations.coordinates import rates
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.mechanism import Mechanism
 from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
@@ -96,7 +99,8 @@ def _moments(solution) -> Solution:
     width = (times[left + 1] - times[left])[:, None]
     s = (moments - times[left])[:, None] / width
     ends = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * q[left] + (3.0 - 2.0 * s) * s**2 * q[left + 1]
-    slopes = s * (1.0 - s) * width * ((1.0 - s) * v[left] - s * v[left + 1])
+    rate = np.asarray(jax.vmap(partial(rates, solution.mechanism.topology))(q, v))
+    slopes = s * (1.0 - s) * width * ((1.0 - s) * rate[left] - s * rate[left + 1])
     return dataclasses.replace(solution, ts=moments, q=ends + slopes, v=v[left])
 
 
@@ -181,11 +185,11 @@ def _canvas(scenery, dpi):
 
 
 def _is_slide(joint):
-    return joint.coordinate_units.count("m") == 1
+    return joint.speed_units.count("m") == 1
 
 
 def _is_hinge(joint):
-    return "rad" in joint.coordinate_units and not _is_slide(joint)
+    return "rad" in joint.speed_units and not _is_slide(joint)
 
 
 def _draw_clock(axes, times):

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from linkax.equations.kinematics import configure
-from linkax.equations.loops import Gap, as_if_closed, cut_frames, gaps, jacobian, residual
+from linkax.equations.coordinates import neutral, on_manifold, retract
+from linkax.equations.kinematics import configure, move, wrapped
+from linkax.equations.loops import Gap, as_if_closed, flips, gaps, jacobian, rate, residual
 from linkax.equations.system import System, system_of
 from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import constrained_solve, invert
@@ -15,7 +16,8 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known, number
 from linkax.simulation.accuracy import BALANCED
 from linkax.simulation.outset import ON_BRANCH, moving_joints
-from linkax.simulation.state import State, joint_coordinates, wrapped
+from linkax.simulation.state import State
+from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
 
 MOST_STEPS = 100
 LONGEST_STEP = 0.7  # radians, or lengths of the mechanism
@@ -24,65 +26,85 @@ SMALL = 1e-15
 TURNS = 10
 BESIDE = 1e-2
 CLOSED = 1e-9  # remaining gap, relative to the mechanism's length
+# Starts of the search beside the guess, by which it leaves a saddle of the gap, or a bad guess.
+ATTEMPTS = np.array([0.0, 1e-2, 1e-1, 0.3, 0.3, 0.6, 0.6, 1.0, 1.0, 1.0, 1.5, 1.5, 1.5, 1.5, 3.0, 3.0, 3.0, 3.0])
 
 
 class AssemblyError(ValueError):
     """The loops of a mechanism cannot be closed at the positions that were asked for."""
 
 
-def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None) -> State:
+def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t=0.0) -> State:
     """A state with closed loops, from coordinates and speeds of some of the joints.
 
     **Arguments:**
 
-    - `positions`: {joint name: coordinate [rad or m]}, of joints in the tree or cut; held.
-    - `speeds`: {joint name: speed [rad/s or m/s]}; held.
-    - `guess`: {joint name: coordinate} of joints in the tree, where the search starts (default
-      zero); chooses the assembly mode.
+    - `positions`: {joint name: coordinates [rad or m]}, of joints in the tree or cut; held. A
+      number for a joint with one coordinate, else all of them; see the joint types.
+    - `speeds`: {joint name: speeds [rad/s or m/s]}, likewise; held.
+    - `guess`: {joint name: coordinates} of joints in the tree, where the search starts (default:
+      frames that coincide); chooses the assembly mode.
+    - `t`: time [s], which matters to drives.
 
     Coordinates that are not held change as little as the loops allow from the guess, and
     speeds that are not held are the smallest that the loops allow, both measured in radians
-    and in lengths of the mechanism. In a singular configuration, where branches of the motion
-    cross, speeds lie on the branch nearest to these; give more of them to choose another.
+    and in lengths of the mechanism. Where the search does not get from the guess to closed loops,
+    it starts again beside it, a little and then farther. In a singular configuration, where
+    branches of the motion cross, speeds lie on the branch nearest to these; give more of them to
+    choose another.
 
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
     raised; `linkax.simulate` marks such a state in its result.
     """
-    positions, speeds = _by_joint(mechanism, positions, "position"), _by_joint(mechanism, speeds, "speed")
-    guess = _by_joint(mechanism, guess, "guess")
+    positions, guess = _coordinates(mechanism, positions, "position"), _coordinates(mechanism, guess, "guess")
+    speeds = _by_joint(mechanism, speeds, "speed", lambda joint: len(joint.speed_units))
     for name in guess:
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
-    state, remainder = _assemble(mechanism, positions, speeds, guess)
+    state, remainder = _assemble(mechanism, positions, speeds, guess, jnp.asarray(t, float))
     if known(state.q) is not None:
-        _raise_if_open(mechanism, state, jax.tree.map(np.asarray, remainder))
+        _raise_if_open(mechanism, state, t, jax.tree.map(np.asarray, remainder))
     return state
 
 
-def _by_joint(mechanism, values, what):
-    checked = {}
-    for name, entry in (values or {}).items():
-        count = mechanism.joint(name).num_coordinates
-        scalar = np.ndim(entry) == 0
-        if scalar and count != 1:
-            raise ValueError(f"{what} of joint {name!r} is one number; the joint has {count} coordinates")
-        checked[name] = number([entry] if scalar else entry, (count,), f"{what} of joint {name!r}")
+def _coordinates(mechanism, values, what):
+    checked = _by_joint(mechanism, values, what, lambda joint: joint.num_coordinates)
+    for name, entry in checked.items():
+        if mechanism.joint(name).has_quaternion and known(entry) is not None and not np.any(known(entry)[:4]):
+            raise ValueError(f"{what} of joint {name!r} has a quaternion of zeros; no rotation is (1, 0, 0, 0)")
     return checked
 
 
-def _raise_if_open(mechanism, state, remainder):
+def _by_joint(mechanism, values, what, count):
+    checked = {}
+    for name, entry in (values or {}).items():
+        expected = count(mechanism.joint(name))
+        scalar = np.ndim(entry) == 0
+        if scalar and expected != 1:
+            raise ValueError(f"{what} of joint {name!r} is one number; the joint has {expected} of them")
+        checked[name] = number([entry] if scalar else entry, (expected,), f"{what} of joint {name!r}")
+    return checked
+
+
+def _raise_if_open(mechanism, state, t, remainder):
     topology = mechanism.topology
+    held = ", ".join(map(repr, remainder.positions)) or "none"
+    remains = lambda size, unit: f"a gap of {size:.6g} {unit} remains (positions held: {held})"
+    advice = "check lengths and offsets, hold fewer positions, or give another guess"
     cuts = topology.joints[topology.num_bodies :]
     for name, distance, angle in zip(cuts, remainder.gap.distance, remainder.gap.angle, strict=True):
         for size, unit, scale in ((distance, "m", remainder.length), (angle, "rad", 1.0)):
             if not size <= CLOSED * scale:
-                held = ", ".join(map(repr, remainder.positions)) or "none"
-                raise AssemblyError(
-                    f"joint {name!r} does not close: a gap of {size:.6g} {unit} remains (positions held: {held}); "
-                    "check lengths and offsets, hold fewer positions, or give another guess"
-                )
+                raise AssemblyError(f"joint {name!r} does not close: {remains(size, unit)}; {advice}")
+    for constraint, size in zip(mechanism.constraints, remainder.gap.constraints, strict=True):
+        if not size <= CLOSED * max(remainder.length, 1.0):
+            joints = ", ".join(map(repr, constraint.joints))
+            raise AssemblyError(
+                f"{constraint.described} of joint {joints} is not met at t = {float(t):.6g} s: "
+                f"{remains(size, 'rad or m')}; {advice}"
+            )
     for what, misses in (("position", remainder.positions), ("speed", remainder.speeds)):
         for name, miss in misses.items():
             if not np.all(np.abs(miss) <= CLOSED * max(remainder.length, 1.0)):
@@ -92,8 +114,8 @@ def _raise_if_open(mechanism, state, remainder):
                 )
     if not remainder.off_branch <= ON_BRANCH * BALANCED.method(state.q.dtype).rank_tolerance:
         system = system_of(mechanism, state.q.dtype)
-        basis = Crossing.at(system, state.q, BALANCED.method(state.q.dtype).rank_tolerance).inverse.basis
-        names = ", ".join(map(repr, moving_joints(system, state.q, basis)))
+        basis = Crossing.at(system, t, state.q, BALANCED.method(state.q.dtype).rank_tolerance).inverse.basis
+        names = ", ".join(map(repr, moving_joints(system, t, state.q, basis)))
         raise AssemblyError(
             "the configuration is singular, and the speeds asked lie on no branch of the motion; its branches cross "
             f"in the motion of joints {names}, so ask for the speeds of other joints among them, or of fewer"
@@ -111,38 +133,46 @@ class _Remainder(eqx.Module):
 
 
 class _Demand(eqx.Module):
-    """Closed loops, and coordinates of joints that are held at values."""
+    """Closed loops at time t, and coordinates of joints that are held at values."""
 
     system: System
+    t: jax.Array
     held: dict[str, jax.Array]
 
     def misses(self, q):
-        """How far each held coordinate is from where it should be."""
+        """How far each held joint is from where it should be, one number for each of its speeds."""
         topology, apart = self.system.topology, {}
+        configuration = configure(self.system, self.t, q)
         for name, entry in self.held.items():
-            kind = topology.joint_types[topology.joints.index(name)]
-            is_angle = np.array([unit == "rad" for unit in kind.coordinate_units])
-            apart[name] = joint_coordinates(self.system, name, q) - entry
+            kind, found = topology.joint_types[topology.joints.index(name)], configuration.joint_coordinates(name)
+            turns = 4 * kind.has_quaternion
+            missed = found[turns:] - entry[turns:]
             if name not in topology.coordinates:
-                apart[name] = wrapped(apart[name], is_angle)
+                angles = np.array([unit == "rad" for unit in kind.speed_units[3 * kind.has_quaternion :]], dtype=bool)
+                missed = wrapped(missed, angles)
+            if kind.has_quaternion:
+                turn = multiply(found[:4], conjugate(entry[:4] / jnp.linalg.norm(entry[:4])))
+                missed = jnp.concatenate([rotation_vector(turn), missed])
+            apart[name] = missed
         return apart
 
     def rows(self, q):
-        """All that must vanish: loop rows, then misses."""
-        loops = residual(cut_frames(configure(self.system, q)))
-        return jnp.concatenate([loops, *self.misses(q).values()])
+        """All that must vanish: loop rows, axes that point apart, misses."""
+        configuration = configure(self.system, self.t, q)
+        return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(q).values()])
 
     def jacobian(self, q):
         """Derivative of the rows, where the loops are closed; elsewhere the direction that closes them."""
-        loops = jacobian(as_if_closed(cut_frames(configure(self.system, q))))
-        held = jax.jacfwd(self.misses)(q)
-        return jnp.concatenate([loops, *held.values()])
+        configuration = as_if_closed(configure(self.system, self.t, q))
+        still = jnp.zeros(self.system.topology.num_speeds, q.dtype)
+        held = jax.jacfwd(lambda change: self.misses(retract(self.system.topology, q, change)))(still)
+        return jnp.concatenate([jacobian(configuration), flips(configuration)[1], *held.values()])
 
     def least_change(self, q, right):
         """The smallest change that changes the rows by `right`, in radians and lengths of the mechanism."""
-        units, rows = self.system.coordinate_units, self.jacobian(q)
+        units, rows = self.system.units, self.jacobian(q)
         inverse = invert(None, rows, units, BALANCED.method(q.dtype).rank_tolerance)
-        return constrained_solve(inverse, jnp.diag(units**-2), rows, jnp.zeros_like(q), right)[0]
+        return constrained_solve(inverse, jnp.diag(units**-2), rows, jnp.zeros_like(units), right)[0]
 
     def size(self, q):
         rows = self.rows(q)
@@ -150,7 +180,7 @@ class _Demand(eqx.Module):
 
     def descent(self, q):
         """The steepest descent of the rows' squares, as long as their linearisation says."""
-        units, rows, slopes = self.system.coordinate_units, self.rows(q), self.jacobian(q)
+        units, rows, slopes = self.system.units, self.rows(q), self.jacobian(q)
         downhill = -(units**2) * (rows @ slopes)
         change = slopes @ downhill
         scale = jnp.sum(change * change)
@@ -166,9 +196,10 @@ class _Demand(eqx.Module):
         def improve(carry):
             count, q, size, _ = carry
             steps = jnp.stack([self.least_change(q, -self.rows(q)), self.descent(q)])
-            longest = jnp.max(jnp.abs(steps / self.system.coordinate_units), axis=1, keepdims=True, initial=0.0)
+            longest = jnp.max(jnp.abs(steps / self.system.units), axis=1, keepdims=True, initial=0.0)
             steps = steps * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0))
-            tries = (q + STEP_FRACTIONS[:, None, None] * steps).reshape(-1, len(q))
+            changes = (STEP_FRACTIONS[:, None, None] * steps).reshape(-1, steps.shape[1])
+            tries = jax.vmap(lambda change: retract(self.system.topology, q, change))(changes)
             tries = jnp.concatenate([tries, q[None]])
             sizes = jax.vmap(self.size)(tries)
             best = jnp.argmin(sizes)
@@ -177,65 +208,90 @@ class _Demand(eqx.Module):
         begin = (jnp.zeros((), int), q, self.size(q), jnp.asarray(jnp.inf, q.dtype))
         return lax.while_loop(unfinished, improve, begin)[1]
 
-    def speeds(self, q):
-        """The smallest speeds with the rates held, or near to them on a branch of the motion.
+    def search(self, q):
+        """Coordinates that meet the demand, from q, or else from beside it; the nearest miss where none do."""
+        beside = np.random.default_rng(0).normal(size=(len(ATTEMPTS), self.system.topology.num_speeds))
+        starts = jnp.asarray(ATTEMPTS[:, None] * beside, q.dtype) * self.system.units
 
-        Newton steps from rest on J v = 0, the rates held, and γ(v, v) in the range of J; the first
-        leads to the smallest speeds, and where the rank of J is constant, these are on a branch.
+        def unfinished(carry):
+            count, _, size = carry
+            return (count < len(ATTEMPTS)) & (size > CLOSED)
 
-        **Returns:** speeds, (n_v,); the smallest speeds, (n_v,); and how far the former are from
-        such a branch, relative to the speeds.
-        """
-        system, tolerance = self.system, BALANCED.method(q.dtype).rank_tolerance
-        rates = jnp.concatenate([jnp.zeros(system.topology.num_rows), *self.held.values()])
-        largest = jnp.max(jnp.abs(rates), initial=0.0)
-        scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
-        crossing, rows = Crossing.at(system, q, tolerance), self.jacobian(q)
-        metric = jnp.diag(system.coordinate_units**-2)
-        # A little beside the smallest speeds, which may lie just between two branches.
-        beside = BESIDE * crossing.inverse.basis @ jnp.ones_like(q)
+        def attempt(carry):
+            count, best, size = carry
+            found = self.meet(retract(self.system.topology, q, starts[count]))
+            reached = self.size(found)
+            return count + 1, jnp.where(reached < size, found, best), jnp.minimum(reached, size)
 
-        def turn(v, first):
-            off, slopes = crossing.off_branch(v), jax.jacfwd(crossing.off_branch)(v)
-            rest = jnp.concatenate([rates / scale - rows @ v, -off])
-            slopes = jnp.concatenate([rows, slopes])
-            inverse = invert(None, slopes, system.coordinate_units, tolerance)
-            v = v + constrained_solve(inverse, metric, slopes, jnp.zeros_like(v), rest)[0]
-            return v + jnp.where(first & (_off(crossing, v) > ON_BRANCH * tolerance), beside, 0.0), v
-
-        v, turns = lax.scan(turn, jnp.zeros_like(q), jnp.arange(TURNS) == 0)
-        missed = jnp.max(jnp.abs(rates / scale - rows @ v), initial=0.0)
-        return scale * v, scale * turns[0], jnp.maximum(_off(crossing, v), missed)
+        begin = (jnp.zeros((), int), q, jnp.asarray(jnp.inf, q.dtype))
+        return lax.while_loop(unfinished, attempt, begin)[1]
 
 
-def _off(crossing, v):
-    """How far speeds are from a branch, relative to their square."""
-    fastest = jnp.max(jnp.abs(v / crossing.configuration.system.coordinate_units), initial=0.0)
-    off = jnp.max(jnp.abs(crossing.off_branch(v)), initial=0.0)
-    return jnp.where(fastest > 0.0, off / jnp.where(fastest > 0.0, fastest, 1.0) ** 2, 0.0)
+def _speeds(system, t, q, held):
+    """The smallest speeds with those of joints held, or near to them on a branch of the motion.
+
+    Newton steps from rest on J v = b, the speeds held, and γ(v, v) in the range of J; the first
+    leads to the smallest speeds, and where the rank of J is constant, these are on a branch.
+
+    **Returns:** speeds, (n_v,); how far the smallest speeds are from those held, by joint; and
+    how far the speeds are from such a branch, relative to themselves.
+    """
+    tolerance = BALANCED.method(q.dtype).rank_tolerance
+    crossing = Crossing.at(system, t, q, tolerance)
+
+    def of_joints(v):
+        motion = move(crossing.configuration, v)
+        return {name: motion.joint_speeds(name) for name in held}
+
+    asked = jnp.concatenate([rate(system, t), *held.values()])
+    largest = jnp.max(jnp.abs(asked), initial=0.0)
+    scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
+    still = jnp.zeros(system.topology.num_speeds, q.dtype)
+    rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(of_joints)(still).values()])
+    metric = jnp.diag(system.units**-2)
+    # A little beside the smallest speeds, which may lie just between two branches.
+    beside = BESIDE * crossing.inverse.basis @ jnp.ones_like(still)
+
+    def off_branch(v):
+        fastest = crossing.fastest(v)
+        off = jnp.max(jnp.abs(crossing.off_branch(v, scale)), initial=0.0)
+        return jnp.where(fastest > 0.0, off / jnp.where(fastest > 0.0, fastest, 1.0) ** 2, 0.0)
+
+    def turn(v, first):
+        off = lambda v: crossing.off_branch(v, scale)
+        rest = jnp.concatenate([asked / scale - rows @ v, -off(v)])
+        slopes = jnp.concatenate([rows, jax.jacfwd(off)(v)])
+        inverse = invert(None, slopes, system.units, tolerance)
+        v = v + constrained_solve(inverse, metric, slopes, jnp.zeros_like(v), rest)[0]
+        return v + jnp.where(first & (off_branch(v) > ON_BRANCH * tolerance), beside, 0.0), v
+
+    v, turns = lax.scan(turn, still, jnp.arange(TURNS) == 0)
+    missed = jnp.max(jnp.abs(asked / scale - rows @ v), initial=0.0)
+    reached = of_joints(scale * turns[0])
+    misses = {name: reached[name] - held[name] for name in held}
+    return scale * v, misses, jnp.maximum(off_branch(v), missed)
 
 
 @eqx.filter_jit
-def _assemble(mechanism, positions, speeds, guess):
+def _assemble(mechanism, positions, speeds, guess, t):
     system = system_of(mechanism, jnp.result_type(float))
     topology = system.topology
-    q = jnp.zeros(topology.num_coordinates, system.dtype)
+    q = neutral(topology, system.dtype)
     for name, entry in {**guess, **positions}.items():
         if name in topology.coordinates:
             q = q.at[topology.coordinates[name]].set(entry)
-    placed, moving = _Demand(system, positions), _Demand(system, speeds)
-    q = lax.stop_gradient(lax.stop_gradient(placed).meet(lax.stop_gradient(q)))
+    demand = _Demand(system, t, positions)
+    q = lax.stop_gradient(lax.stop_gradient(demand).search(lax.stop_gradient(on_manifold(topology, q))))
     # Carries the derivative. Loops that do not close stay as open as they were found.
-    met = placed.size(q) <= CLOSED
-    q = q + jnp.where(met, placed.least_change(q, -placed.rows(q)), 0.0)
+    met = demand.size(q) <= CLOSED
+    q = retract(topology, q, jnp.where(met, demand.least_change(q, -demand.rows(q)), 0.0))
 
-    v, smallest, off_branch = moving.speeds(q)
-    reached = jax.jvp(moving.misses, (q,), (smallest,))[1]
+    v, misses, off_branch = _speeds(system, t, q, speeds)
     remainder = _Remainder(
-        gap=gaps(cut_frames(configure(system, q))),
+        gap=gaps(configure(system, t, q)),
         length=system.length,
-        positions=placed.misses(q),
-        speeds={name: reached[name] - speeds[name] for name in speeds},
+        positions=demand.misses(q),
+        speeds=misses,
         off_branch=off_branch,
     )
     return State(q, v), remainder

@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from linkax.equations.coordinates import rates, speeds
 from linkax.equations.system import System
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
@@ -53,18 +54,24 @@ class Problem(eqx.Module):
         """q and v of such vectors, (..., n_q + n_v + 1)."""
         return y[..., : self.system.topology.num_coordinates], y[..., self.system.topology.num_coordinates : -1]
 
+    def errors(self, y, error):
+        """Error estimates of q and v at a vector y, as changes (n_v,) of both."""
+        of_q, of_v = self.unpacked(error)
+        return speeds(self.system.topology, self.unpacked(y)[0], of_q), of_v
+
     def derivative(self, t, y):
         """(q̇, v̇, d) for diffrax."""
         correct = self.accuracy.projection in ("both", "stage")
 
-        def rates(y):
-            return self.packed(*self.method.derivative(self.system, t, *self.unpacked(y), correct))
+        def packed_rates(y):
+            v, acceleration, q, distance = self.method.derivative(self.system, t, *self.unpacked(y), correct)
+            return self.packed(rates(self.system.topology, q, v), acceleration, distance)
 
-        return _apart(rates, y, jnp.full_like(y, jnp.nan))
+        return _apart(packed_rates, y, jnp.full_like(y, jnp.nan))
 
-    def close(self, y):
+    def close(self, t, y):
         """The `State` on the manifold to rounding."""
-        return State(*self.method.close(self.system, *self.unpacked(y)))
+        return State(*self.method.close(self.system, t, *self.unpacked(y)))
 
 
 def _apart(function, y, otherwise):
@@ -162,10 +169,10 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         y1, error, dense_info, inner, result = self.solver.step(terms, t0, t1, y0, args, inner, made_jump)
         stages = self._stages(dense_info, t1 - t0)
         if self.after_step:
-            y1, error, arrives = _corrected(args, y1, error)
+            y1, error, arrives = _corrected(args, t1, y1, error)
         else:
             arrives = leaves if stages is None else stages[-1]
-            error = None if error is None else args.unpacked(error)
+            error = None if error is None else args.errors(y1, error)
         if stages is None:
             leaves_now, passes, retry = leaves, arrives, jnp.ones_like(arrives)
         else:
@@ -182,12 +189,12 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         return lax.stop_gradient(dense_info["k"][:, -1] / duration)
 
 
-def _corrected(problem, y1, error):
+def _corrected(problem, t1, y1, error):
     """State and error estimate after the correction, and the distance d there."""
-    errors = () if error is None else problem.unpacked(error)
+    errors = () if error is None else problem.errors(y1, error)
 
     def correct(y):
-        q, v, errors_left, distance = problem.method.correct(problem.system, *problem.unpacked(y), errors)
+        q, v, errors_left, distance = problem.method.correct(problem.system, t1, *problem.unpacked(y), errors)
         return problem.packed(q, v, y[-1]), errors_left, distance
 
     undefined = jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), (y1, errors))
@@ -225,15 +232,15 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         _, v = args.unpacked(y0)
         if dt0 is None and self._is_adaptive:
             # Not diffrax's choice, which would compile the equations of motion twice more.
-            fastest = jnp.max(jnp.abs(v / args.system.coordinate_units), initial=0.0)
+            fastest = jnp.max(jnp.abs(v / args.system.units), initial=0.0)
             turning = jnp.where(fastest > 0.0, FIRST_TURN / jnp.where(fastest > 0.0, fastest, 1.0), jnp.inf)
             dt0 = jnp.minimum(FIRST_STEP * (t1 - t0), turning)
             dt0 = lax.stop_gradient(dt0)
-        first, state = self.controller.init(terms, t0, t1, args.unpacked(y0), dt0, args, func, error_order)
+        first, state = self.controller.init(terms, t0, t1, (v, v), dt0, args, func, error_order)
         return first, (state, jnp.zeros((), int))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        units = args.system.coordinate_units
+        units = args.system.units
         scales = tuple(_magnitudes(args.unpacked(y), units) for y in (y0, y1_candidate))
         scaled = None
         if y_error.error is not None:
@@ -266,7 +273,7 @@ def _magnitudes(state, units):
     """What the tolerances are relative to: one for coordinates, the largest speed for speeds."""
     q, v = state
     fastest = jnp.max(jnp.abs(v / units), initial=0.0)
-    return jnp.where(jnp.isfinite(q), 1.0, q), jnp.broadcast_to(fastest, v.shape)
+    return jnp.where(jnp.all(jnp.isfinite(q)), jnp.ones_like(v), jnp.nan), jnp.broadcast_to(fastest, v.shape)
 
 
 def _noise(distance, rank_tolerance):

@@ -8,10 +8,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
+from linkax.equations.kinematics import configure, move
 from linkax.equations.loops import gaps
 from linkax.equations.system import System
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.simulation.state import State, joint_coordinates
+from linkax.simulation.state import State
 
 MOVES = 1e-6  # of the largest speed
 ON_BRANCH = 10.0  # rank tolerances that speeds may be off a branch, relative to their square
@@ -44,7 +45,7 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     At rest the motion departs along the acceleration. In a singular configuration that is free
     to take any direction that J leaves; on a branch only if the loops have no force that turns it.
     """
-    q, v = method.close(system, state.q, state.v)
+    q, v = method.close(system, t, state.q, state.v)
     start = State(q, v)
     if system.topology.num_rows == 0:
         finite, true = jnp.all(jnp.isfinite(jnp.concatenate([q, v]))), jnp.ones((), bool)
@@ -53,10 +54,9 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     method, system, t, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, q, v))
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
     crossing, acceleration = method.departure(system, t, q)
-    gap = gaps(crossing.cuts)
+    gap = gaps(crossing.configuration)
     small = jnp.sqrt(jnp.finfo(system.dtype).eps)
-    size = lambda speeds: jnp.max(jnp.abs(speeds / system.coordinate_units), initial=0.0)
-    at_rest = size(v) ** 2 <= jnp.finfo(system.dtype).eps * size(acceleration)
+    at_rest = crossing.fastest(v) ** 2 <= jnp.finfo(system.dtype).eps * crossing.fastest(acceleration)
     off, rank = crossing.along(jnp.where(at_rest, acceleration, v))
     # Rows that are not quite dependent contradict each other by as much.
     on_branch = jnp.max(jnp.abs(off), initial=0.0) <= ON_BRANCH * method.rank_tolerance
@@ -64,18 +64,21 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
         state=start,
         rank=rank,
         finite=finite,
-        closed=jnp.all(gap.distance <= small * system.length) & jnp.all(gap.angle <= small),
+        closed=jnp.all(gap.distance <= small * system.length)
+        & jnp.all(gap.angle <= small)
+        & jnp.all(gap.constraints <= small * system.coupling_unit),
         on_branch=on_branch | at_rest,
         unique=on_branch | jnp.logical_not(at_rest),
     )
 
 
-def moving_joints(system: System, q, directions) -> list[str]:
+def moving_joints(system: System, t, q, directions) -> list[str]:
     """Names of the joints, in the tree or cut, that move in some of the directions, (n_v, k)."""
     size = np.max(np.abs(directions), initial=0.0)
+    configuration = configure(system, t, q)
 
     def moves(name):
-        change = jax.jacfwd(lambda q: joint_coordinates(system, name, q))(q) @ directions
-        return np.max(np.abs(change), initial=0.0) > MOVES * size
+        speeds = jax.vmap(lambda v: move(configuration, v).joint_speeds(name), in_axes=1)(directions)
+        return np.max(np.abs(speeds), initial=0.0) > MOVES * size
 
     return [name for name in system.topology.joints if moves(name)]

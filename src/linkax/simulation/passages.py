@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from diffrax import ThirdOrderHermitePolynomialInterpolation
 
+from linkax.equations.coordinates import on_manifold, rates
 from linkax.equations.system import system_of
 
 REFINEMENTS = 4
@@ -93,10 +94,12 @@ def _between_states(solution, intervals, places):
             t1=jnp.ones((), dtype),
             y0=solution.q[k],
             y1=solution.q[k + 1],
-            k0=duration * solution.v[k],
-            k1=duration * solution.v[k + 1],
+            k0=duration * rates(system.topology, solution.q[k], solution.v[k]),
+            k1=duration * rates(system.topology, solution.q[k + 1], solution.v[k + 1]),
         )
-        here = method.crossing(system, hermite.evaluate(place))
-        return here.jacobian @ method.crossing(system, solution.q[k]).inverse.normal, here.inverse.distance
+        t = solution.ts[k] + place * duration
+        here = method.crossing(system, t, on_manifold(system.topology, hermite.evaluate(place)))
+        before = method.crossing(system, solution.ts[k], solution.q[k])
+        return here.jacobian @ before.inverse.normal, here.inverse.distance
 
     return jax.vmap(at)(intervals, places)

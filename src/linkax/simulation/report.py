@@ -73,18 +73,20 @@ def _finite(number):
 def trajectory(solution: Solution, points) -> dict[str, np.ndarray]:
     """Arrays for an NPZ file, times first, SI units, ground axes.
 
-    - `t`; `q`, `v` and `coordinates`: coordinates and speeds of the tree's joints, and whose
-      each is; `energy`; `rank`; `position_violation`, `velocity_violation`,
+    - `t`; `q` and `coordinates`, `v` and `speeds`: coordinates and speeds of the tree's joints,
+      and whose each is; `energy`; `rank`; `position_violation`, `velocity_violation`,
       `acceleration_violation` as in `linkax.Violation`.
     - `position_NAME`, `velocity_NAME`, `acceleration_NAME` of each named point.
     - `force_NAME`, `moment_NAME`: reaction of each joint on its child.
     """
-    slices = solution.mechanism.topology.coordinates
+    topology = solution.mechanism.topology
+    owners = lambda slices: [name for name, taken in slices.items() for _ in range(taken.stop - taken.start)]
     kept = {
         "t": solution.ts,
         "q": solution.q,
         "v": solution.v,
-        "coordinates": [name for name, taken in slices.items() for _ in range(taken.stop - taken.start)],
+        "coordinates": owners(topology.coordinates),
+        "speeds": owners(topology.speeds),
         "energy": solution.energy(),
         "rank": solution.rank(),
     }

@@ -107,13 +107,16 @@ def _time(name, entry):
 
 def _check_state(mechanism, state):
     topology = mechanism.topology
-    for what, array in (("q", state.q), ("v", state.v)):
-        if jnp.shape(array) != (topology.num_coordinates,):
+    for what, array, slices, size in (
+        ("q", state.q, topology.coordinates, topology.num_coordinates),
+        ("v", state.v, topology.speeds, topology.num_speeds),
+    ):
+        if jnp.shape(array) != (size,):
             raise ValueError(
                 f"state.{what} has shape {jnp.shape(array)}; this mechanism's tree has {topology.num_coordinates} "
-                "coordinates: make the state with linkax.assemble"
+                f"coordinates and {topology.num_speeds} speeds: make the state with linkax.assemble"
             )
-        for name, taken in topology.coordinates.items():
+        for name, taken in slices.items():
             if known(array) is not None and not np.all(np.isfinite(known(array)[taken])):
                 raise ValueError(f"state.{what} of joint {name!r} is {known(array)[taken].tolist()}; it must be finite")
 
@@ -138,7 +141,7 @@ class _OnManifold(eqx.Module):
     function: callable
 
     def __call__(self, t, y, problem, **unused):
-        return self.function(t, problem.close(y), problem.mechanism)
+        return self.function(t, problem.close(t, y), problem.mechanism)
 
 
 def _wrapped_saves(subs):
@@ -213,13 +216,14 @@ def _simulate(
         throw=False,
         progress_meter=progress_meter,
     )
-    (ts, _), (ys, y_end) = found.ts, found.ys
+    (ts, t_end), (ys, y_end) = found.ts, found.ys
     if plain:
-        states = jax.vmap(problem.close)(jnp.concatenate([ys, y_end]))
+        times = jnp.concatenate([jnp.where(jnp.isfinite(ts), ts, t0), t_end])
+        states = jax.vmap(problem.close)(times, jnp.concatenate([ys, y_end]))
         end, saved = State(states.q[-1], states.v[-1]), jnp.isfinite(ts)[:, None]
         q, v, ys = jnp.where(saved, states.q[:-1], jnp.inf), jnp.where(saved, states.v[:-1], jnp.inf), None
     else:
-        q, v, end = None, None, problem.close(y_end[0])
+        q, v, end = None, None, problem.close(t_end[0], y_end[0])
     return Solution(
         mechanism=mechanism,
         accuracy=accuracy,
@@ -227,7 +231,7 @@ def _simulate(
         q=q,
         v=v,
         ys=ys,
-        t_end=found.ts[1][0],
+        t_end=t_end[0],
         end=end,
         stats=found.stats,
         result=_result(found.result, outset),
@@ -258,7 +262,7 @@ def _raise_if_failed(solution, state):
     reason = f"simulation stopped {when}: {RESULTS[solution.result]}"
     if (solution.result == RESULTS.no_branch) | (solution.result == RESULTS.not_unique):
         method, system = solution.accuracy.method(state.q.dtype), system_of(solution.mechanism, state.q.dtype)
-        crossing = Crossing.at(system, state.q, method.rank_tolerance)
-        names = moving_joints(system, state.q, crossing.inverse.basis)
+        crossing = Crossing.at(system, solution.t_end, state.q, method.rank_tolerance)
+        names = moving_joints(system, solution.t_end, state.q, crossing.inverse.basis)
         reason += f" The branches cross in the motion of joints {', '.join(map(repr, names))}."
     raise SimulationError(reason, solution)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
 from linkax.equations.kinematics import configure, move
-from linkax.equations.loops import cut_frames, immobile_residual, jacobian, residual
+from linkax.equations.loops import immobile_residual, jacobian, rate, residual
 from linkax.equations.reactions import Reaction, reactions
 from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
@@ -19,7 +19,7 @@ from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
-from linkax.simulation.state import State, joint_coordinates
+from linkax.simulation.state import State
 from linkax.spatial.rotations import cross, rotate
 
 
@@ -46,7 +46,7 @@ class _Instant(NamedTuple):
 
     @property
     def configuration(self):
-        return configure(self.system, self.q)
+        return configure(self.system, self.t, self.q)
 
     @property
     def motion(self):
@@ -198,9 +198,9 @@ class Solution(eqx.Module):
         return jnp.broadcast_to(offset, (*self.ts.shape[:-1], 3))
 
     def _joint(self, function, name):
-        count = self.mechanism.joint(name).num_coordinates
+        self.mechanism.joint(name)
         values = _over_times(function, self, name)
-        return values[..., 0] if count == 1 else values
+        return values[..., 0] if values.shape[-1] == 1 else values
 
 
 @eqx.filter_jit
@@ -224,8 +224,9 @@ def _over_times(function, solution, *details):
 def _evaluate(solution, t):
     dtype = solution.end.q.dtype
     system, method = system_of(solution.mechanism, dtype), solution.accuracy.method(dtype, solution.rank_nearby)
-    y = solution.interpolation.evaluate(jnp.asarray(t, dtype))
-    return Problem(solution.mechanism, system, method, solution.accuracy).close(y)
+    t = jnp.asarray(t, dtype)
+    y = solution.interpolation.evaluate(t)
+    return Problem(solution.mechanism, system, method, solution.accuracy).close(t, y)
 
 
 def _arm(configuration, body, point):
@@ -259,17 +260,15 @@ def _angular_velocity(instant, body):
 
 
 def _joint(instant, name):
-    return joint_coordinates(instant.system, name, instant.q)
+    return instant.configuration.joint_coordinates(name)
 
 
 def _joint_speed(instant, name):
-    return jax.jvp(lambda q: joint_coordinates(instant.system, name, q), (instant.q,), (instant.v,))[1]
+    return instant.motion.joint_speeds(name)
 
 
 def _reactions(instant):
-    motion, dynamics = instant.motion, instant.dynamics
-    cuts = cut_frames(motion.configuration)
-    return reactions(instant.t, motion, cuts, dynamics.acceleration, dynamics.multipliers)
+    return reactions(instant.motion, instant.dynamics.acceleration, instant.dynamics.multipliers)
 
 
 def _reaction(instant, joint):
@@ -286,9 +285,10 @@ def _potential_energy(instant):
 
 
 def _violation(instant):
-    cuts = cut_frames(instant.configuration)
-    position = jnp.concatenate([residual(cuts), immobile_residual(cuts)])
-    return Violation(*map(_size, (position, jacobian(cuts) @ instant.v, instant.dynamics.violation)))
+    configuration = instant.configuration
+    position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
+    velocity = jacobian(configuration) @ instant.v - rate(instant.system, instant.t)
+    return Violation(*map(_size, (position, velocity, instant.dynamics.violation)))
 
 
 def _size(rows):
@@ -296,7 +296,7 @@ def _size(rows):
 
 
 def _largest(instant):
-    units = instant.system.coordinate_units
+    units = instant.system.units
     speed = _size(instant.v / units)
     return speed, jnp.maximum(_size(instant.dynamics.acceleration / units), speed**2)
 

@@ -50,16 +50,21 @@ def rotation_about_first_axis(angle) -> Float[Array, "3 3"]:
     return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
 
 
-def frame_about_axis(axis):
+def angle_about_first_axis(rotation):
+    """The angle [rad] in (−π, π] of a rotation (3, 3) about the first axis."""
+    return jnp.arctan2(rotation[2, 1], rotation[1, 1])
+
+
+def frame_about_axis(axis, second=None):
     """A right-handed frame whose first axis is the unit vector `axis`, shape (3, 3).
 
-    The second axis is the normalised product of the coordinate axis that is farthest from
-    `axis` (in cyclic order) with it, so coordinate axes give coordinate frames. NumPy in
-    gives NumPy out.
+    The second axis is given, a unit vector at a right angle, or is the normalised product of the
+    coordinate axis that is farthest from `axis` (in cyclic order) with it, so coordinate axes give
+    coordinate frames. NumPy in gives NumPy out.
     """
-    xp = np if isinstance(axis, np.ndarray) else jnp
-    index = xp.argmax(xp.abs(axis))
-    helper = xp.eye(3)[(index + 2) % 3]
-    second = xp.cross(helper, axis)
-    second = second / xp.sqrt(xp.sum(second * second))
+    xp = np if isinstance(axis, np.ndarray) and isinstance(second, np.ndarray | None) else jnp
+    if second is None:
+        helper = xp.eye(3)[(xp.argmax(xp.abs(axis)) + 2) % 3]
+        second = xp.cross(helper, axis)
+        second = second / xp.sqrt(xp.sum(second * second))
     return xp.stack([axis, second, xp.cross(axis, second)], axis=-1)

@@ -4,10 +4,11 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from linkax.model.bodies import GROUND, Frame, Ground, RigidBody
-from linkax.model.numbers import Constant, unit_axis, value
+from linkax.model.bodies import Frame, frame_of
+from linkax.model.numbers import Constant, perpendicular_axis, unit_axis, value
 from linkax.spatial.rotations import frame_about_axis
 
 
@@ -16,59 +17,83 @@ class AbstractJoint(eqx.Module):
 
     The two frames coincide in orientation at coordinate zero. The joint's axes h¹, h², h³ are
     fixed in each of them, h¹ along `axis`, which is given in the parent's frame. Coordinates
-    and speeds are those of the child relative to the parent.
+    and speeds are those of the child relative to the parent: turns first, then displacements.
 
-    A joint type is this class with its static facts filled in. In the spanning tree it moves
-    the child by `rotation` and `displacement`, both in joint axes, with speeds along
-    `angular_subspace` and `linear_subspace`. Cut, it locks `locked_rotations` and
-    `locked_translations` (Table 1 of the paper), and `measure` reads its coordinates.
+    A joint type is this class with its static facts filled in. In the spanning tree it turns
+    the child by `rotation` and moves it along `linear_subspace`, both in joint axes. Cut, it
+    locks `locked_rotations` and `locked_translations` (Table 1 of the paper), and `measure`
+    reads its coordinates.
     """
 
-    # Units of the coordinates, one for each: "rad" or "m".
-    coordinate_units: ClassVar[tuple[str, ...]]
-    # Columns of the motion subspace in joint axes, angular and linear part.
+    # Units of the speeds, one for each: "rad" or "m" (per second).
+    speed_units: ClassVar[tuple[str, ...]]
+    # Coordinates begin with a unit quaternion, whose rate is the angular velocity of the first three speeds.
+    has_quaternion: ClassVar[bool] = False
+    # Columns of the motion subspace in joint axes of the parent, angular and linear part. The
+    # angular part is that at coordinate zero where `angular_subspace_at` says otherwise.
     angular_subspace: ClassVar[tuple[tuple[float, float, float], ...]]
     linear_subspace: ClassVar[tuple[tuple[float, float, float], ...]]
+    # The linear part is to be multiplied by `number`.
+    is_screw: ClassVar[bool] = False
+    # The angular part for joints whose axes turn with their own coordinates: (coordinates) -> (n, 3).
+    angular_subspace_at: ClassVar = None
     # Pairs (i, j), counted from 0, of axes that stay orthogonal: parent's hⁱ and child's hʲ.
     locked_rotations: ClassVar[tuple[tuple[int, int], ...]]
     # Axes, counted from 0, that point the same way on both; locked rotations alone allow a flip.
     aligned_axes: ClassVar[tuple[int, ...]]
     # Axes of the parent, counted from 0, along which the frames do not separate.
     locked_translations: ClassVar[tuple[int, ...]]
+    # One row more, of h₁ⁱ·h₂ʲ for these pairs and h₁ⁱ·s/ℓ for these axes together, by `combined`.
+    combined_rotations: ClassVar[tuple[tuple[int, int], ...]] = ()
+    combined_translations: ClassVar[tuple[int, ...]] = ()
+    # False for what only ever closes loops.
+    can_carry: ClassVar[bool] = True
 
     name: str = eqx.field(static=True)
     parent: Frame
     child: Frame
     axis: Constant | Float[Array, "3"]
+    second_axis: Constant | Float[Array, "3"] | None
     cut: bool = eqx.field(static=True)
 
-    def __init__(self, name: str, parent, child, axis, *, cut: bool = False):
+    def __init__(self, name: str, parent, child, axis, *, second_axis=None, cut: bool = False):
         """**Arguments:**
 
         - `name`: unique in the mechanism.
         - `parent`, `child`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
         - `axis`: h¹ in the parent's frame: "x", "-y", …, three numbers (both part of the
           structure), or a JAX array (traced). Need not be normalised.
+        - `second_axis`: h² likewise, at a right angle to h¹. Default: the one that gives
+          coordinate frames where h¹ is a coordinate axis, in cyclic order.
         - `cut`: keep this joint out of the spanning tree; it must close a loop.
         """
         if not isinstance(name, str) or not name:
             raise ValueError(f"joint name is {name!r}; give a non-empty string")
         self.name = name
-        self.parent = _frame(parent, f"joint {name!r}: parent")
-        self.child = _frame(child, f"joint {name!r}: child")
+        self.parent = frame_of(parent, f"joint {name!r}: parent")
+        self.child = frame_of(child, f"joint {name!r}: child")
         if self.parent.body == self.child.body:
             raise ValueError(f"joint {name!r} connects body {self.parent.body!r} with itself; give two bodies")
         self.axis = unit_axis(axis, f"joint {name!r}: axis")
+        self.second_axis = second_axis
+        if second_axis is not None:
+            self.second_axis = perpendicular_axis(second_axis, self.axis, f"joint {name!r}: second_axis")
         self.cut = bool(cut)
 
     @property
     def num_coordinates(self) -> int:
-        """Number of coordinates, and of speeds."""
-        return len(self.coordinate_units)
+        """Number of coordinates: of speeds, and one more where a quaternion is among them."""
+        return len(self.speed_units) + self.has_quaternion
+
+    @property
+    def number(self):
+        """The number of this joint that its type's rows or motion need (a length [m]), or None."""
+        return None
 
     def frames(self):
         """The joint's axes as columns, in the parent's and in the child's body axes."""
-        axes = frame_about_axis(value(self.axis))
+        second = None if self.second_axis is None else value(self.second_axis)
+        axes = frame_about_axis(value(self.axis), second)
         return value(self.parent.rotation) @ axes, value(self.child.rotation) @ axes
 
     @staticmethod
@@ -78,20 +103,15 @@ class AbstractJoint(eqx.Module):
 
     @staticmethod
     @abc.abstractmethod
-    def displacement(coordinates: Float[Array, " n"]) -> Float[Array, "3"]:
-        """Origin of the child's frame from that of the parent's, in joint axes [m]."""
-
-    @staticmethod
-    @abc.abstractmethod
     def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[Array, " n"]:
         """Coordinates from the child's axes and origin, both in joint axes of the parent."""
 
+    @staticmethod
+    def combined(rotations, translations, number) -> Float[Array, ""]:
+        """The row that combines others; `number` is the joint's own in units of ℓ."""
+        raise NotImplementedError
 
-def _frame(place, what) -> Frame:
-    if isinstance(place, Ground):
-        return GROUND.at([0.0, 0.0, 0.0])
-    if isinstance(place, RigidBody):
-        return place.at([0.0, 0.0, 0.0])
-    if isinstance(place, Frame):
-        return place
-    raise ValueError(f"{what} is {place!r}; give a body, body.at(...), or lx.GROUND")
+
+def unturned(coordinates) -> Float[Array, "3 3"]:
+    """The `rotation` of a joint that does not turn."""
+    return jnp.eye(3, dtype=coordinates.dtype)

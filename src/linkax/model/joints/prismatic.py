@@ -1,6 +1,4 @@
-import jax.numpy as jnp
-
-from linkax.model.joints.joint import AbstractJoint
+from linkax.model.joints.joint import AbstractJoint, unturned
 
 
 class Prismatic(AbstractJoint):
@@ -9,20 +7,14 @@ class Prismatic(AbstractJoint):
     Coordinate: distance [m] of the child's frame from the parent's along h¹.
     """
 
-    coordinate_units = ("m",)
+    speed_units = ("m",)
     angular_subspace = ((0.0, 0.0, 0.0),)
     linear_subspace = ((1.0, 0.0, 0.0),)
     locked_rotations = ((1, 2), (0, 2), (0, 1))
     aligned_axes = (0, 1, 2)
     locked_translations = (1, 2)
 
-    @staticmethod
-    def rotation(coordinates):
-        return jnp.eye(3, dtype=coordinates.dtype)
-
-    @staticmethod
-    def displacement(coordinates):
-        return coordinates[0] * jnp.array([1.0, 0.0, 0.0], coordinates.dtype)
+    rotation = staticmethod(unturned)
 
     @staticmethod
     def measure(rotation, separation):

@@ -1,7 +1,5 @@
-import jax.numpy as jnp
-
 from linkax.model.joints.joint import AbstractJoint
-from linkax.spatial.rotations import rotation_about_first_axis
+from linkax.spatial.rotations import angle_about_first_axis, rotation_about_first_axis
 
 
 class Revolute(AbstractJoint):
@@ -11,7 +9,7 @@ class Revolute(AbstractJoint):
     from a cut joint it lies in (−π, π].
     """
 
-    coordinate_units = ("rad",)
+    speed_units = ("rad",)
     angular_subspace = ((1.0, 0.0, 0.0),)
     linear_subspace = ((0.0, 0.0, 0.0),)
     locked_rotations = ((0, 2), (0, 1))
@@ -23,9 +21,5 @@ class Revolute(AbstractJoint):
         return rotation_about_first_axis(coordinates[0])
 
     @staticmethod
-    def displacement(coordinates):
-        return jnp.zeros(3, coordinates.dtype)
-
-    @staticmethod
     def measure(rotation, separation):
-        return jnp.arctan2(rotation[2, 1], rotation[1, 1])[None]
+        return angle_about_first_axis(rotation)[None]

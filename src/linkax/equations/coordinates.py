@@ -1,0 +1,69 @@
+"""Coordinates q that are not all integrals of speeds v: unit quaternions among them.
+
+Without a quaternion q̇ = v, and all of this is addition. Quaternions are those of
+`linkax.model.joints`: the child's axes in the parent's, speeds in axes of the parent.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from linkax.model.topology import Topology
+from linkax.spatial.quaternions import conjugate, from_rotation_vector, multiply, normalised
+
+
+def _places(topology):
+    """Indices of quaternions in q, (n, 4), and of their angular velocities in v, (n, 3)."""
+    starts = topology.quaternions
+    return starts[:, :1] + np.arange(4), starts[:, 1:] + np.arange(3)
+
+
+def neutral(topology: Topology, dtype) -> Float[Array, " n_q"]:
+    """Coordinates at which the frames of every joint in the tree coincide."""
+    q = np.zeros(topology.num_coordinates)
+    q[topology.quaternions[:, 0]] = 1.0
+    return jnp.asarray(q, dtype)
+
+
+def retract(topology: Topology, q, change) -> Float[Array, " n_q"]:
+    """The coordinates after a change (n_v,) of a finite size: q ⊕ δ."""
+    if not len(topology.quaternions):
+        return q + change
+    in_q, in_v = _places(topology)
+    turned = normalised(multiply(from_rotation_vector(change[in_v]), q[in_q]))
+    return q.at[topology.plain[:, 0]].add(change[topology.plain[:, 1]]).at[in_q].set(turned)
+
+
+def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:
+    """The coordinates with quaternions of length one."""
+    if not len(topology.quaternions):
+        return q
+    in_q, _ = _places(topology)
+    return q.at[in_q].set(normalised(q[in_q]))
+
+
+def rates(topology: Topology, q, v) -> Float[Array, " n_q"]:
+    """q̇ at speeds v."""
+    if not len(topology.quaternions):
+        return v
+    in_q, in_v = _places(topology)
+    omega = v[in_v]
+    turning = 0.5 * multiply(jnp.concatenate([jnp.zeros_like(omega[:, :1]), omega], axis=-1), q[in_q])
+    return jnp.zeros_like(q).at[topology.plain[:, 0]].set(v[topology.plain[:, 1]]).at[in_q].set(turning)
+
+
+def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
+    """The speeds v of which q̇ are the rates; small changes of q likewise."""
+    if not len(topology.quaternions):
+        return rates
+    in_q, in_v = _places(topology)
+    omega = 2.0 * multiply(rates[in_q], conjugate(q[in_q]))[:, 1:]
+    empty = jnp.zeros(topology.num_speeds, q.dtype)
+    return empty.at[topology.plain[:, 1]].set(rates[topology.plain[:, 0]]).at[in_v].set(omega)
+
+
+def by_speed(topology: Topology, q) -> Float[Array, " n_v"]:
+    """The coordinates at the places of their speeds, zero for those of quaternions."""
+    if not len(topology.quaternions):
+        return q
+    return jnp.zeros(topology.num_speeds, q.dtype).at[topology.plain[:, 1]].set(q[topology.plain[:, 0]])

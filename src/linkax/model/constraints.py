@@ -1,0 +1,109 @@
+"""Constraints on coordinates of joints: gears, ropes over sheaves, drives."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from linkax.model.functions import Law
+from linkax.model.numbers import known, number
+from linkax.model.terms import Term, term
+
+
+class AbstractConstraint(eqx.Module):
+    """A linear relation between coordinates of joints in the tree: Σ coefficient × coordinate = right side.
+
+    - `terms`: whose coordinates these are.
+    """
+
+    name: str = eqx.field(static=True)
+    terms: tuple[Term, ...] = eqx.field(static=True)
+    coefficients: Float[Array, " n"]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The joints that it relates, which go into the spanning tree."""
+        return tuple(dict.fromkeys(joint for joint, _ in self.terms))
+
+    @property
+    def described(self) -> str:
+        """What errors call it."""
+        return f"{type(self).__name__.lower()} {self.name!r}"
+
+    @abc.abstractmethod
+    def right_side(self, t) -> Float[Array, ""]:
+        """At time t [s]."""
+
+
+class Coupling(AbstractConstraint):
+    """A linear relation between joint coordinates, such as gears, a rack, or a rope over sheaves.
+
+    `Coupling("gears", {"pinion": 2.0, "wheel": 1.0})` keeps 2 × pinion + wheel = 0. The joints go
+    into the spanning tree, so that angles count whole turns. Its reaction is one number, μ: it
+    acts along each joint with coefficient × μ [N m or N].
+
+    **Arguments:**
+
+    - `name`: unique among joints and constraints.
+    - `coefficients`: {joint: factor of its coordinate [rad or m]}. For one of several coordinates
+      give (joint, index), counted like the joint's speeds.
+    - `offset`: what the sum is equal to.
+
+    **Raises:** `ValueError` for no coefficient, or for all of them zero.
+    """
+
+    offset: Float[Array, ""]
+
+    def __init__(self, name: str, coefficients, offset=0.0):
+        self.name = _checked_name(name, "coupling")
+        if not isinstance(coefficients, dict) or not coefficients:
+            raise ValueError(f"coupling {name!r}: coefficients are {coefficients!r}; give {{joint: factor, ...}}")
+        self.terms = tuple(term(key, f"coupling {name!r}") for key in coefficients)
+        what = f"coupling {name!r}: coefficients"
+        self.coefficients = number(list(coefficients.values()), (len(coefficients),), what)
+        if known(self.coefficients) is not None and not np.any(known(self.coefficients)):
+            raise ValueError(f"{what} are all zero: {coefficients!r}; give a factor that is not zero")
+        self.offset = number(offset, (), f"coupling {name!r}: offset")
+
+    def right_side(self, t):
+        return self.offset
+
+
+class Drive(AbstractConstraint):
+    """A joint's coordinate prescribed as a function of time. Its reaction is the driving torque.
+
+    `Drive("motor", "bearing", lambda t: 2.0 * t)` turns `bearing` at 2 rad/s. The reaction is the
+    torque [N m], or force [N] on a slide, along the joint.
+
+    **Arguments:**
+
+    - `name`: unique among joints and constraints.
+    - `joint`: a joint's name, or (name, index) for one of several coordinates, counted like speeds.
+    - `motion`: t [s] ↦ coordinate [rad or m], twice differentiable by JAX. Numbers to be traced
+      go in by `jax.tree_util.Partial(function, numbers)` or an `equinox.Module`.
+
+    **Raises:** `ValueError` for a function that does not return one number.
+    """
+
+    motion: Law
+
+    def __init__(self, name: str, joint, motion):
+        self.name = _checked_name(name, "drive")
+        self.terms = (term(joint, f"drive {name!r}"),)
+        self.coefficients = np.ones(1)
+        if not callable(motion):
+            raise ValueError(f"drive {name!r}: motion is {motion!r}; give a function of time, lambda t: ...")
+        self.motion = Law(motion, (), f"drive {name!r}")
+        jax.eval_shape(self.motion, jnp.zeros(()))
+
+    def right_side(self, t):
+        return self.motion(t)
+
+
+def _checked_name(name, what):
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{what} name is {name!r}; give a non-empty string")
+    return name

@@ -1,0 +1,28 @@
+import jax.numpy as jnp
+
+from linkax.model.joints.joint import AbstractJoint
+from linkax.spatial.rotations import angle_about_first_axis, rotation_about_first_axis
+
+
+class Cylindrical(AbstractJoint):
+    """A sleeve on a shaft: the child turns about h¹ and slides along it.
+
+    Coordinates: angle [rad] from the parent's h² to the child's, right-handed about h¹, and
+    distance [m] of the child's frame from the parent's along h¹. Read from a cut joint the angle
+    lies in (−π, π].
+    """
+
+    speed_units = ("rad", "m")
+    angular_subspace = ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    linear_subspace = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    locked_rotations = ((0, 2), (0, 1))
+    aligned_axes = (0,)
+    locked_translations = (1, 2)
+
+    @staticmethod
+    def rotation(coordinates):
+        return rotation_about_first_axis(coordinates[0])
+
+    @staticmethod
+    def measure(rotation, separation):
+        return jnp.stack([angle_about_first_axis(rotation), separation[0]])

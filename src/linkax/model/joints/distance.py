@@ -1,0 +1,50 @@
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from linkax.model.joints.joint import AbstractJoint, unturned
+from linkax.model.numbers import number, require
+
+
+class Distance(AbstractJoint):
+    """A massless rod with a ball at each end, or a rope that stays taut, between two points.
+
+    It keeps the origins of two frames at a fixed distance and has no coordinate. It carries no
+    body: each body needs joints to ground besides. Its reaction on the child is a force along the
+    line between the two points, on the child towards the parent where the rod is pulled.
+
+    **Arguments:** `name`, unique among joints and constraints; `parent`, `child`: a body (its
+    reference frame), `body.at(...)`, or `lx.GROUND`; `length` [m].
+
+    **Raises:** `ValueError` for a length that is not positive.
+    """
+
+    speed_units = ()
+    angular_subspace = ()
+    linear_subspace = ()
+    locked_rotations = ()
+    aligned_axes = ()
+    locked_translations = ()
+    combined_translations = (0, 1, 2)
+    can_carry = False
+
+    length: Float[Array, ""]
+
+    rotation = staticmethod(unturned)
+
+    def __init__(self, name: str, parent, child, length):
+        super().__init__(name, parent, child, "x")
+        what = f"distance {name!r}: length [m]"
+        remedy = "it must be positive; to join two points, use lx.Spherical"
+        self.length = require(number(length, (), what), lambda metres: metres > 0.0, what, remedy)
+
+    @property
+    def number(self):
+        return self.length
+
+    @staticmethod
+    def measure(rotation, separation):
+        return jnp.zeros(0, separation.dtype)
+
+    @staticmethod
+    def combined(rotations, translations, number):
+        return (jnp.sum(translations * translations) / number - number) / 2.0

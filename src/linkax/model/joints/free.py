@@ -1,0 +1,33 @@
+import jax.numpy as jnp
+
+from linkax.model.joints.joint import AbstractJoint
+from linkax.spatial.quaternions import from_rotation_matrix, rotation_matrix
+
+
+class Free(AbstractJoint):
+    """No joint at all: the child moves freely, and its motion is measured from the parent.
+
+    Coordinates: unit quaternion (w, x, y, z) of the child's frame in the parent's, and the position
+    [m] of its origin in the parent's frame. Speeds: angular velocity relative to the parent
+    [rad/s], and velocity of the child's origin seen from the parent [m/s], both in axes of the
+    parent's frame. Read from a cut joint, w ≥ 0.
+    """
+
+    speed_units = ("rad", "rad", "rad", "m", "m", "m")
+    has_quaternion = True
+    angular_subspace = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), *3 * ((0.0, 0.0, 0.0),))
+    linear_subspace = (*3 * ((0.0, 0.0, 0.0),), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    locked_rotations = ()
+    aligned_axes = ()
+    locked_translations = ()
+
+    def __init__(self, name: str, parent, child, *, cut: bool = False):
+        super().__init__(name, parent, child, "x", cut=cut)
+
+    @staticmethod
+    def rotation(coordinates):
+        return rotation_matrix(coordinates[:4])
+
+    @staticmethod
+    def measure(rotation, separation):
+        return jnp.concatenate([from_rotation_matrix(rotation), separation])

@@ -1,0 +1,54 @@
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from linkax.model.joints.joint import AbstractJoint
+from linkax.model.numbers import number, require
+from linkax.spatial.rotations import angle_about_first_axis, rotation_about_first_axis
+
+
+class Screw(AbstractJoint):
+    """A nut on a screw: the child turns about h¹ and advances along it in proportion.
+
+    Coordinate: angle [rad] from the parent's h² to the child's, right-handed about h¹; the child's
+    frame is `pitch` times the angle along h¹ from the parent's. `pitch` [m/rad] is the advance
+    for one radian, 2π times smaller than the lead of a thread; positive for a right-handed one.
+    Cut, the joint may sit on any turn of its thread, and its angle lies in (−π, π].
+
+    **Raises:** `ValueError` for a pitch of zero.
+    """
+
+    speed_units = ("rad",)
+    angular_subspace = ((1.0, 0.0, 0.0),)
+    linear_subspace = ((1.0, 0.0, 0.0),)
+    is_screw = True
+    locked_rotations = ((0, 2), (0, 1))
+    aligned_axes = (0,)
+    locked_translations = (1, 2)
+    combined_rotations = ((1, 1), (2, 1))
+    combined_translations = (0,)
+
+    pitch: Float[Array, ""]
+
+    def __init__(self, name: str, parent, child, axis, pitch, *, cut: bool = False):
+        super().__init__(name, parent, child, axis, cut=cut)
+        what = f"joint {name!r}: pitch [m/rad]"
+        self.pitch = require(number(pitch, (), what), lambda p: p != 0.0, what, "without advance, use lx.Revolute")
+
+    @property
+    def number(self):
+        return self.pitch
+
+    @staticmethod
+    def rotation(coordinates):
+        return rotation_about_first_axis(coordinates[0])
+
+    @staticmethod
+    def measure(rotation, separation):
+        return angle_about_first_axis(rotation)[None]
+
+    @staticmethod
+    def combined(rotations, translations, number):
+        angle = jnp.arctan2(rotations[1], rotations[0])
+        turns = lax.stop_gradient(jnp.round((translations[0] / number - angle) / (2.0 * jnp.pi)))
+        return translations[0] - number * (angle + 2.0 * jnp.pi * turns)

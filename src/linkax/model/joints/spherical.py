@@ -1,0 +1,28 @@
+from linkax.model.joints.joint import AbstractJoint
+from linkax.spatial.quaternions import from_rotation_matrix, rotation_matrix
+
+
+class Spherical(AbstractJoint):
+    """A ball and socket: the child turns freely about the common origin of both frames.
+
+    Coordinates: unit quaternion (w, x, y, z) of the child's frame in the parent's, (1, 0, 0, 0)
+    where the two coincide. Speeds: angular velocity of the child relative to the parent [rad/s],
+    in axes of the parent's frame. Read from a cut joint, w ≥ 0.
+    """
+
+    speed_units = ("rad", "rad", "rad")
+    has_quaternion = True
+    angular_subspace = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    linear_subspace = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    locked_rotations = ()
+    aligned_axes = ()
+    locked_translations = (0, 1, 2)
+
+    rotation = staticmethod(rotation_matrix)
+
+    def __init__(self, name: str, parent, child, *, cut: bool = False):
+        super().__init__(name, parent, child, "x", cut=cut)
+
+    @staticmethod
+    def measure(rotation, separation):
+        return from_rotation_matrix(rotation)

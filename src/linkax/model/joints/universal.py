@@ -1,0 +1,37 @@
+import jax.numpy as jnp
+
+from linkax.model.joints.joint import AbstractJoint
+from linkax.spatial.rotations import compose, rotation_about_first_axis
+
+
+class Universal(AbstractJoint):
+    """A Cardan joint: the child turns about the parent's h¹, and then about its own h².
+
+    Coordinates: the two angles [rad], right-handed about h¹ and h². Read from a cut joint both lie
+    in (−π, π]. Any pair of angles is regular.
+    """
+
+    speed_units = ("rad", "rad")
+    angular_subspace = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    linear_subspace = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    locked_rotations = ((0, 1),)
+    aligned_axes = ()
+    locked_translations = (0, 1, 2)
+
+    @staticmethod
+    def rotation(coordinates):
+        c, s = jnp.cos(coordinates[1]), jnp.sin(coordinates[1])
+        zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+        about_second = jnp.stack([c, zero, s, zero, one, zero, -s, zero, c]).reshape(3, 3)
+        return compose(rotation_about_first_axis(coordinates[0]), about_second)
+
+    @staticmethod
+    def angular_subspace_at(coordinates):
+        c, s = jnp.cos(coordinates[0]), jnp.sin(coordinates[0])
+        zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+        return jnp.stack([one, zero, zero, zero, c, s]).reshape(2, 3)
+
+    @staticmethod
+    def measure(rotation, separation):
+        first = jnp.arctan2(rotation[2, 1], rotation[1, 1])
+        return jnp.stack([first, jnp.arctan2(rotation[0, 2], rotation[0, 0])])

@@ -1,0 +1,18 @@
+"""Which coordinate or speed of a joint an element acts along."""
+
+from typing import NamedTuple
+
+
+class Term(NamedTuple):
+    """A joint's name, and which of its speeds, counted from 0; None for the only one."""
+
+    joint: str
+    index: int | None
+
+
+def term(entry, what: str) -> Term:
+    """A joint's name, or (name, index), as a user gives it; `what` names the element in errors."""
+    joint, index = entry if isinstance(entry, tuple) and len(entry) == 2 else (entry, None)
+    if not isinstance(joint, str) or not (index is None or (isinstance(index, int) and not isinstance(index, bool))):
+        raise ValueError(f"{what}: joint is {entry!r}; give the name of a joint, or (name, index of its speed)")
+    return Term(joint, index)
