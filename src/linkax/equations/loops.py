@@ -54,6 +54,12 @@ def plain_rows(configuration: Configuration) -> Rows:
     return _chosen(configuration, topology.rotation_rows, topology.translation_rows)
 
 
+def immobile_rows(configuration: Configuration) -> Rows:
+    """The rotation and translation rows that no motion can change."""
+    topology = configuration.system.topology
+    return _chosen(configuration, topology.immobile_rotation_rows, topology.immobile_translation_rows)
+
+
 def combined_rows(configuration: Configuration) -> Rows:
     """The rotation and translation rows that combined rows are functions of."""
     topology = configuration.system.topology
@@ -108,9 +114,7 @@ def residual(configuration: Configuration) -> Float[Array, " m"]:
 
 def immobile_residual(configuration: Configuration) -> Float[Array, " m_immobile"]:
     """The rows that no motion can change; nonzero where the loop cannot be closed."""
-    topology = configuration.system.topology
-    rows = _chosen(configuration, topology.immobile_rotation_rows, topology.immobile_translation_rows)
-    return _residual(configuration, rows)
+    return _residual(configuration, immobile_rows(configuration))
 
 
 def _jacobian(configuration: Configuration, rows: Rows):

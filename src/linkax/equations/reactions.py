@@ -1,6 +1,6 @@
 """Reactions of all joints at one instant, from accelerations and multipliers."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,12 +8,16 @@ from jaxtyping import Array, Float
 
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
 from linkax.equations.kinematics import Configuration, Motion, bodies_of_cuts, by_body, over_subtree
-from linkax.equations.loops import Rows, combined_rows, plain_rows, sorted_multipliers
-from linkax.spatial.rotations import cross
+from linkax.equations.loops import Rows, combined_rows, immobile_rows, plain_rows, sorted_multipliers
+from linkax.model.forces import Load
+from linkax.spatial.rotations import compose, cross, rotate, transpose
+
+Side = Literal["child", "parent"]
+Axes = Literal["ground", "joint"]
 
 
 class Reaction(NamedTuple):
-    """What a joint does to its child, in ground axes.
+    """What a joint does to its child, in ground axes, unless it was asked for otherwise.
 
     - `force` [N], and `moment` about the origin of the child's frame [N m], (…, 3) each. The
       parent receives the opposite force at the same point, and the opposite moment.
@@ -23,13 +27,18 @@ class Reaction(NamedTuple):
     moment: Float[Array, "... 3"]
 
 
-def cut_reactions(configuration: Configuration, multipliers) -> Reaction:
-    """Reactions of the cut joints, (n_cut, 3) each: the paper's Table 3, by virtual power."""
+def cut_reactions(configuration: Configuration, multipliers, immobile=None) -> Reaction:
+    """Reactions of the cut joints, (n_cut, 3) each: the paper's Table 3, by virtual power.
+
+    `immobile`: multipliers of the rows that no motion changes; zero by default.
+    """
     found = sorted_multipliers(configuration, multipliers)
     nothing = jnp.zeros_like(configuration.separation)
     reaction = _added(Reaction(nothing, nothing), plain_rows(configuration), found.plain)
     if configuration.system.topology.combining:
         reaction = _added(reaction, combined_rows(configuration), found.combined)
+    if immobile is not None:
+        reaction = _added(reaction, immobile_rows(configuration), immobile)
     return reaction
 
 
@@ -48,23 +57,40 @@ def reactions(motion: Motion, acceleration, multipliers) -> Reaction:
     A tree joint carries what its subtree needs: inertia less applied loads less the reactions
     of cut joints on it (recursive Newton-Euler; the paper's Fig. 6).
     """
-    load = applied_load(motion)
+    load, cut = applied_load(motion), cut_reactions(motion.configuration, multipliers)
     force, moment = inertial_wrench(motion, *body_accelerations(motion, acceleration))
-    return _carried(motion.configuration, force - load.force, moment - load.moment, load.joint_force, multipliers)
+    needed = Load(force - load.force, moment - load.moment, load.joint_force)
+    return _carried(motion.configuration, needed, cut, multipliers)
 
 
-def reactions_to_multipliers(configuration: Configuration, multipliers) -> Reaction:
+def reactions_to(configuration: Configuration, multipliers, immobile) -> Reaction:
     """The part of all joints' reactions that multipliers alone cause, (n_j, 3) each."""
-    nothing = jnp.zeros((configuration.system.topology.num_bodies, 3), configuration.system.dtype)
-    none = jnp.zeros(configuration.system.topology.num_speeds, configuration.system.dtype)
-    return _carried(configuration, nothing, nothing, none, multipliers)
+    cut = cut_reactions(configuration, multipliers, immobile)
+    return _carried(configuration, Load.none(configuration.system), cut, multipliers)
 
 
-def _carried(configuration: Configuration, force, moment, joint_force, multipliers) -> Reaction:
-    """Reactions where bodies need these wrenches, (n_b, 3) each, the moment about the centre of mass."""
+def seen_from(configuration: Configuration, reactions: Reaction, on: Side, axes: Axes) -> Reaction:
+    """Reactions of all joints on a body, at its own frame's origin, in ground axes or its joint axes."""
+    system, topology = configuration.system, configuration.system.topology
+    parent, child = np.array(topology.parent), np.array(topology.child)
+    force, moment = reactions
+    joint_axes = configuration.joint_axes
+    if on == "parent":
+        apart = configuration.parent_arm - rotate(configuration.rotation[parent], system.parent_offset)
+        apart = apart.at[topology.num_bodies :].add(configuration.separation)
+        force, moment = -force, -moment - cross(apart, force)
+    elif axes == "joint":
+        joint_axes = compose(configuration.rotation[child], system.child_axes)
+    if axes == "joint":
+        force, moment = rotate(transpose(joint_axes), force), rotate(transpose(joint_axes), moment)
+    return Reaction(force, moment)
+
+
+def _carried(configuration: Configuration, needed: Load, cut: Reaction, multipliers) -> Reaction:
+    """Reactions where bodies need wrenches, and tree joints already have forces along their speeds."""
     system, topology = configuration.system, configuration.system.topology
     count = topology.num_bodies
-    cut = cut_reactions(configuration, multipliers)
+    force, moment, joint_force = needed
     joint_force = joint_force + sorted_multipliers(configuration, multipliers).constraints @ system.coupling
     moment = moment + cross(configuration.position[:-1] + configuration.center_of_mass(), force)
 

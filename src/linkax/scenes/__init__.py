@@ -1,11 +1,16 @@
 """Ready-made scenes: the mechanisms of the paper, and benchmark problems with known answers."""
 
+from linkax.scenes.bricard import BRICARD
 from linkax.scenes.crank_slider import CRANK_SLIDER
 from linkax.scenes.n_four_bar import N_FOUR_BAR
 from linkax.scenes.pendulum import PENDULUM
+from linkax.scenes.planar_four_bar import PLANAR_FOUR_BAR
+from linkax.scenes.rigid_crane import RIGID_CRANE
 from linkax.scenes.scene import Scene
+from linkax.scenes.spatial_four_link import SPATIAL_FOUR_LINK
 
-SCENES: dict[str, Scene] = {scene.name: scene for scene in (PENDULUM, CRANK_SLIDER, N_FOUR_BAR)}
+_ALL = (PENDULUM, CRANK_SLIDER, N_FOUR_BAR, SPATIAL_FOUR_LINK, PLANAR_FOUR_BAR, BRICARD, RIGID_CRANE)
+SCENES: dict[str, Scene] = {scene.name: scene for scene in _ALL}
 
 
 def scene(name: str) -> Scene:

@@ -1,6 +1,6 @@
 """The motion that a simulation found, and what can be read from it."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -9,10 +9,11 @@ from jaxtyping import Array, Float, Int
 
 from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
 from linkax.equations.kinematics import configure, move
-from linkax.equations.loops import immobile_residual, jacobian, rate, residual
-from linkax.equations.reactions import Reaction, reactions
+from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
+from linkax.equations.reactions import Axes, Reaction, Side, reactions, reactions_to, seen_from
 from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
+from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number
 from linkax.simulation.accuracy import Accuracy
@@ -21,6 +22,8 @@ from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
 from linkax.simulation.state import State
 from linkax.spatial.rotations import cross, rotate
+
+UNCHANGED = 1e-6  # by a self-stress of magnitude one
 
 
 class Violation(NamedTuple):
@@ -118,14 +121,40 @@ class Solution(eqx.Module):
         """Speed of a joint, in the tree or cut [rad/s or m/s]."""
         return self._joint(_joint_speed, name)
 
-    def reaction(self, joint: str) -> Reaction:
-        """What a joint does to its child: `force` [N], `moment` about the child's frame [N m]."""
-        self.mechanism.joint(joint)
-        return _over_times(_reaction, self, self.mechanism.topology.joints.index(joint))
+    def reaction(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
+        """What a joint or a constraint does.
+
+        **Arguments:**
+
+        - `name`: of a joint in the tree or cut, or of a constraint.
+        - `on`: "child" or "parent" of the joint. The moment is about the origin of its frame.
+        - `axes`: "ground", or "joint": h¹, h², h³ of the joint on that body.
+
+        **Returns:** a `Reaction` of forces [N] and moments [N m], (n_t, 3) each. For a drive, its
+        torque [N m] or force [N] along the joint, (n_t,); for a coupling, μ: it acts along each
+        joint with coefficient × μ.
+
+        With redundant constraints, reactions are not unique: these are of minimum norm, and
+        `reaction_unique` tells which components can be relied upon.
+        """
+        if name in self.mechanism.topology.constraints:
+            return _over_times(_constraint_force, self, self.mechanism.topology.constraints.index(name))
+        return self._of_joint(_reactions, name, on, axes)
+
+    def reaction_unique(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
+        """Which components of `reaction` the mechanics determine, as booleans of the same shapes.
+
+        A component is unique where no self-stress of the redundant constraints changes it
+        (Wojtyra, Multibody System Dynamics 13, 2005). Rigid bodies determine no more: the rest
+        depends on elasticity, assembly, and here on the choice of the tree.
+        """
+        if name in self.mechanism.topology.constraints:
+            return _over_times(_constraint_unique, self, self.mechanism.topology.constraints.index(name))
+        return self._of_joint(_unique, name, on, axes)
 
     def reactions(self) -> dict[str, Reaction]:
-        """The reactions of all joints, by name."""
-        force, moment = _over_times(_reactions, self)
+        """The reactions of all joints on their children, in ground axes, by name."""
+        force, moment = _over_times(_reactions, self, "child", "ground")
         names = enumerate(self.mechanism.topology.joints)
         return {name: Reaction(force[..., index, :], moment[..., index, :]) for index, name in names}
 
@@ -183,6 +212,16 @@ class Solution(eqx.Module):
         if self.interpolation is None:
             raise ValueError("evaluate needs a dense solution; simulate with saveat=diffrax.SaveAt(dense=True)")
         return _evaluate(self, t)
+
+    def _of_joint(self, function, name, on, axes):
+        """Of reactions of all joints, so that all names share a program, those of one."""
+        for what, entry, choices in (("on", on, get_args(Side)), ("axes", axes, get_args(Axes))):
+            if entry not in choices:
+                raise ValueError(f"{what} is {entry!r}; known: {', '.join(map(repr, choices))}")
+        self.mechanism.joint(name)
+        index = self.mechanism.topology.joints.index(name)
+        force, moment = _over_times(function, self, on, axes)
+        return Reaction(force[..., index, :], moment[..., index, :])
 
     def _body(self, name):
         self.mechanism.body(name)
@@ -267,13 +306,52 @@ def _joint_speed(instant, name):
     return instant.motion.joint_speeds(name)
 
 
-def _reactions(instant):
-    return reactions(instant.motion, instant.dynamics.acceleration, instant.dynamics.multipliers)
+def _least_multipliers(instant):
+    dynamics, configuration = instant.dynamics, instant.configuration
+    if not instant.system.topology.num_rows:
+        return LeastMultipliers(dynamics.multipliers, jnp.zeros((0, 0)))
+    tolerance = instant.method.rank_tolerance
+    rows, units = jacobian(configuration), instant.system.units
+    return least_multipliers(rows, dynamics.multipliers, units, tolerance, dynamics.rank)
 
 
-def _reaction(instant, joint):
-    found = _reactions(instant)
-    return Reaction(found.force[joint], found.moment[joint])
+def _reactions(instant, on, axes):
+    found = reactions(instant.motion, instant.dynamics.acceleration, _least_multipliers(instant).multipliers)
+    return seen_from(instant.configuration, found, on, axes)
+
+
+def _constraint_force(instant, constraint):
+    multipliers = _least_multipliers(instant).multipliers
+    return sorted_multipliers(instant.configuration, multipliers).constraints[constraint]
+
+
+def _self_stresses(instant):
+    """Multipliers with Jᵀλ = 0, a row each: those of rows that motion changes, and of rows that none does."""
+    topology = instant.system.topology
+    immobile = len(topology.immobile_rotation_rows) + len(topology.immobile_translation_rows)
+    free = _least_multipliers(instant).free.T
+    size = len(free) + immobile
+    stresses = jnp.zeros((size, size), instant.q.dtype).at[: len(free), : len(free)].set(free)
+    stresses = stresses.at[len(free) :, len(free) :].set(jnp.eye(immobile))
+    return jnp.split(stresses, [len(free)], axis=1)
+
+
+def _unique(instant, on, axes):
+    configuration = instant.configuration
+
+    def changes(multipliers, immobile):
+        return seen_from(configuration, reactions_to(configuration, multipliers, immobile), on, axes)
+
+    force, moment = jax.vmap(changes)(*_self_stresses(instant))
+    # Multipliers are moments, forces times the length of their loop.
+    still = lambda change: jnp.max(jnp.abs(change), axis=0, initial=0.0) <= UNCHANGED
+    return Reaction(still(force * instant.system.length), still(moment))
+
+
+def _constraint_unique(instant, constraint):
+    topology = instant.system.topology
+    row = topology.num_rows - len(topology.constraints) + constraint
+    return jnp.max(jnp.abs(_self_stresses(instant)[0][:, row]), initial=0.0) <= UNCHANGED
 
 
 def _kinetic_energy(instant):

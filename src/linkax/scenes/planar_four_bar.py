@@ -1,0 +1,69 @@
+"""Planar four-bar of massless links and two particles, of the textbook Learn Multibody Dynamics.
+
+J. Moore, Learn Multibody Dynamics, chapter on holonomic constraints. One link has no mass at all.
+"""
+
+import math
+
+import linkax as lx
+from linkax.scenes.scene import Scene, Variant
+
+
+def _mechanism(parameters):
+    def massless(name, length, particle):
+        """A massless link with a particle at its tip."""
+        tip = [length, 0.0, 0.0]
+        return lx.RigidBody(name, particle, center_of_mass=tip, frames={"base": [0.0, 0.0, 0.0], "tip": tip})
+
+    a = massless("link_a", parameters["a"], parameters["mass_2"])
+    b = massless("link_b", parameters["b"], parameters["mass_3"])
+    c = massless("link_c", parameters["c"], 0.0)
+    return lx.Mechanism(
+        [a, b, c],
+        [
+            lx.Revolute("P1", lx.GROUND, a.at("base"), axis="z"),
+            lx.Revolute("P2", a.at("tip"), b.at("base"), axis="z"),
+            lx.Revolute("P3", b.at("tip"), c.at("base"), axis="z"),
+            lx.Revolute("P4", lx.GROUND.at([parameters["ground"], 0.0, 0.0]), c.at("tip"), axis="z", cut=True),
+        ],
+        [lx.Gravity([0.0, -parameters["gravity"], 0.0])],
+    )
+
+
+def _initial(mechanism, parameters):
+    guess = {"P2": math.radians(6.6), "P3": math.radians(-151.4)}
+    return lx.assemble(mechanism, {"P1": parameters["angle"]}, {"P1": parameters["speed"]}, guess=guess)
+
+
+PLANAR_FOUR_BAR = Scene(
+    name="planar-four-bar",
+    summary="four-bar of massless links with two particles (textbook Learn Multibody Dynamics)",
+    parameters={
+        "a": 0.8,
+        "b": 2.0,
+        "c": 1.0,
+        "ground": 2.0,
+        "mass_2": 1.0,
+        "mass_3": 1.0,
+        "gravity": 9.81,
+        "angle": math.radians(10.0),
+        "speed": 0.0,
+    },
+    meanings={
+        "a": "length of the first link, from P1 to P2 [m]",
+        "b": "length of the second link, from P2 to P3 [m]",
+        "c": "length of the third link, from P3 to P4 [m]",
+        "ground": "from P1 to P4 [m]",
+        "mass_2": "of the particle at P2 [kg]",
+        "mass_3": "of the particle at P3 [kg]",
+        "gravity": "along -y [m/s²]",
+        "angle": "of the first link from +x, at the start [rad]",
+        "speed": "of that angle, at the start [rad/s]",
+    },
+    variants={"textbook": Variant("released from rest at 10 degrees")},
+    default_variant="textbook",
+    t1=10.0,
+    mechanism=_mechanism,
+    initial=_initial,
+    points=lambda parameters: {"P2": ("link_a", "tip"), "P3": ("link_b", "tip")},
+)

@@ -1,0 +1,110 @@
+"""Luffing telescopic crane of rigid sections: a stand-in for example c of the paper, with numbers of our own.
+
+Three sections slide in each other, a rope makes the third one follow the second, and a cylinder
+under the boom luffs it.
+"""
+
+import math
+
+import jax.numpy as jnp
+
+import linkax as lx
+from linkax.scenes.scene import Scene, Variant
+
+SECTION = 10.0  # length of each section [m]
+OVERLAP = 1.0  # how far each section's rear end is ahead of the last one's, retracted [m]
+FOOT = (2.0, -1.0)  # of the luffing cylinder, from the boom's pivot [m]
+HEAD = 4.0  # of the luffing cylinder, along the boom [m]
+
+
+def _section(index, mass):
+    return lx.rod(f"section_{index}", SECTION, mass)
+
+
+def _cylinder(name, mass, center, inertia):
+    """A part of the luffing cylinder, along x; mass [kg], centre of mass [m], inertia [kg m²]."""
+    return lx.RigidBody(name, mass, [center, 0.0, 0.0], [0.0, inertia, inertia])
+
+
+def _mechanism(parameters):
+    sections = [_section(index, parameters[f"mass_{index}"]) for index in (1, 2, 3)]
+    barrel = _cylinder("barrel", 150.0, 1.2, 80.0)
+    piston = _cylinder("piston", 100.0, -1.0, 40.0)
+    payload = lx.point_mass("payload", parameters["payload"])
+    foot, head = lx.GROUND.at([*FOOT, 0.0]), sections[0].at([HEAD, 0.0, 0.0])
+    extension, stiffness, damping = (parameters[f"telescope_{name}"] for name in ("rest", "stiffness", "damping"))
+    return lx.Mechanism(
+        [*sections, barrel, piston, payload],
+        [
+            lx.Revolute("boom", lx.GROUND, sections[0].at("base"), axis="z"),
+            lx.Prismatic("slide_2", sections[0].at("base"), sections[1].at("base"), axis="x"),
+            lx.Prismatic("slide_3", sections[1].at("base"), sections[2].at("base"), axis="x"),
+            lx.Fixed("hook", sections[2].at("tip"), payload),
+            lx.Revolute("foot", foot, barrel, axis="z"),
+            lx.Prismatic("luffing", barrel, piston, axis="x"),
+            lx.Revolute("head", head, piston, axis="z"),
+        ],
+        [
+            lx.Gravity([0.0, -parameters["gravity"], 0.0]),
+            lx.Spring(foot, head, parameters["luffing_stiffness"], _reach(parameters["luffing_angle"])),
+            lx.Damper(foot, head, parameters["luffing_damping"]),
+            lx.JointSpring("slide_2", stiffness, OVERLAP + extension),
+            lx.JointDamper("slide_2", damping),
+        ],
+        [lx.Coupling("rope", {"slide_3": 1.0, "slide_2": -1.0})],
+    )
+
+
+def _reach(angle):
+    """Length of the luffing cylinder at an angle of the boom [m]."""
+    return jnp.hypot(HEAD * jnp.cos(angle) - FOOT[0], HEAD * jnp.sin(angle) - FOOT[1])
+
+
+def _initial(mechanism, parameters):
+    angle, slide = parameters["angle"], OVERLAP + parameters["extension"]
+    inclination = jnp.arctan2(HEAD * jnp.sin(angle) - FOOT[1], HEAD * jnp.cos(angle) - FOOT[0])
+    guess = {"slide_3": slide, "foot": inclination, "luffing": _reach(angle), "head": inclination - angle}
+    guess = {name: value for name, value in guess.items() if name in mechanism.topology.coordinates}
+    return lx.assemble(mechanism, {"boom": angle, "slide_2": slide}, {"boom": 0.0, "slide_2": 0.0}, guess=guess)
+
+
+RIGID_CRANE = Scene(
+    name="rigid-crane",
+    summary="luffing telescopic crane of rigid sections, coupled by a rope (for example c of the paper)",
+    parameters={
+        "mass_1": 1200.0,
+        "mass_2": 900.0,
+        "mass_3": 600.0,
+        "payload": 2000.0,
+        "gravity": 9.81,
+        "luffing_stiffness": 2e7,
+        "luffing_damping": 2e5,
+        "luffing_angle": math.pi / 3,
+        "telescope_stiffness": 5e5,
+        "telescope_damping": 2e4,
+        "telescope_rest": 3.0,
+        "angle": math.pi / 3,
+        "extension": 1.0,
+    },
+    meanings={
+        "mass_1": "of the base section, 10 m long [kg]",
+        "mass_2": "of the second section, 10 m long [kg]",
+        "mass_3": "of the third section, 10 m long [kg]",
+        "payload": "mass at the tip [kg]",
+        "gravity": "along -y [m/s²]",
+        "luffing_stiffness": "of the luffing cylinder [N/m]",
+        "luffing_damping": "of the luffing cylinder [N s/m]",
+        "luffing_angle": "of the boom where the luffing cylinder carries nothing [rad]",
+        "telescope_stiffness": "of the telescoping cylinder [N/m]",
+        "telescope_damping": "of the telescoping cylinder [N s/m]",
+        "telescope_rest": "extension where the telescoping cylinder carries nothing [m]",
+        "angle": "of the boom from +x, at the start [rad]",
+        "extension": "of each section beyond 1 m, at the start [m]",
+    },
+    variants={"reference": Variant("released from rest, retracted")},
+    default_variant="reference",
+    t1=5.0,
+    mechanism=_mechanism,
+    initial=_initial,
+    points=lambda parameters: {"tip": ("section_3", "tip")},
+)

@@ -1,0 +1,56 @@
+"""Rhombus of spatial bodies and hinges, example b of the paper as far as it can be inferred.
+
+Zhao, Qi, Wang, Xu, Applied Mathematics and Mechanics 47(8), 2026, doi 10.21656/1000-0887.450230. The
+paper prints neither lengths nor masses; these are ours. Three constraints are always redundant, and
+a fourth one where all links lie in line.
+"""
+
+import math
+
+import linkax as lx
+from linkax.scenes.scene import Scene, Variant
+
+
+def _mechanism(parameters):
+    length, mass = parameters["length"], parameters["mass"]
+    crank, coupler, rocker = (lx.rod(name, length, mass) for name in ("crank", "coupler", "rocker"))
+    return lx.Mechanism(
+        [crank, coupler, rocker],
+        [
+            lx.Revolute("A", lx.GROUND, crank.at("base"), axis="z"),
+            lx.Revolute("B", crank.at("tip"), coupler.at("base"), axis="z"),
+            lx.Revolute("C", coupler.at("tip"), rocker.at("tip"), axis="z"),
+            lx.Revolute("D", lx.GROUND.at([length, 0.0, 0.0]), rocker.at("base"), axis="z"),
+        ],
+        [lx.Gravity([0.0, -parameters["gravity"], 0.0])],
+    )
+
+
+def _initial(mechanism, parameters):
+    """All joints are given, because a start with the links in line has other branches too."""
+    turning = lambda turn: {"A": turn, "B": -turn, "C": turn, "D": turn}
+    return lx.assemble(mechanism, turning(parameters["angle"]), turning(parameters["speed"]))
+
+
+SPATIAL_FOUR_LINK = Scene(
+    name="spatial-four-link",
+    summary="rhombus of spatial hinges, with redundant constraints and singular positions (example b of the paper)",
+    parameters={"length": 1.0, "mass": 1.0, "gravity": 0.0, "angle": math.pi / 2, "speed": 1.0},
+    meanings={
+        "length": "of every link [m]",
+        "mass": "of every link, a uniform slender rod [kg]",
+        "gravity": "along -y [m/s²]",
+        "angle": "of the crank from +x, at the start [rad]",
+        "speed": "of that angle, at the start [rad/s]",
+    },
+    variants={
+        "FL1": Variant("turns uniformly from upright, without gravity"),
+        "FL2": Variant("turns uniformly from the singular position, without gravity", {"angle": 0.0}),
+        "FL3": Variant("turns under gravity from upright", {"gravity": 9.81, "speed": -1.0}),
+    },
+    default_variant="FL1",
+    t1=20.0,
+    mechanism=_mechanism,
+    initial=_initial,
+    points=lambda parameters: {"C": ("coupler", "tip")},
+)
