@@ -8,12 +8,13 @@ equations for the speeds, whose solutions are the branches.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from linkax.equations.kinematics import Configuration, configure, move
 from linkax.equations.loops import bias, drive_acceleration, jacobian
 from linkax.equations.system import System
-from linkax.linalg.constrained_solve import Inverse, invert
+from linkax.linalg.constrained_solve import Inverse, invert_apart
 from linkax.linalg.pivoted_qr import pivoted_qr
 
 OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
@@ -34,7 +35,8 @@ class Crossing(eqx.Module):
         """At coordinates q, split in the identity metric."""
         configuration = configure(system, t, q)
         rows = jacobian(configuration)
-        return Crossing(configuration, rows, invert(None, rows, system.units, rank_tolerance))
+        inverse = invert_apart(None, rows, system.units, rank_tolerance, system.topology.islands)
+        return Crossing(configuration, rows, inverse)
 
     def _outside(self, rows):
         """Rows of which the part that J reaches is taken off."""
@@ -57,8 +59,8 @@ class Crossing(eqx.Module):
     def _driven(self, scale):
         return drive_acceleration(self.configuration.system, self.configuration.t) / scale**2
 
-    def along(self, v) -> tuple[Float[Array, " m"], Int[Array, ""]]:
-        """Along speeds v, of any size: how far they are from a branch, and the rank next to here.
+    def along(self, v) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
+        """Along speeds v, of any size: how far they are from a branch, and the ranks of all islands next to here.
 
         The first is `off_branch` of speeds of which the largest is one; the second, by first-order
         perturbation, rank(J) + rank(Uᵀ J̇ N) with U, N the null spaces of Jᵀ and J.
@@ -71,5 +73,11 @@ class Crossing(eqx.Module):
         speeds = jnp.concatenate([direction[:, None], direction[:, None] + basis, direction[:, None] - basis], axis=1)
         outside = self._outside(jax.vmap(self._bias, in_axes=1, out_axes=1)(speeds))
         plus, minus = jnp.split(outside[:, 1:], 2, axis=1)
-        opening = jnp.abs(jnp.diagonal(pivoted_qr(0.25 * (plus - minus)).r))
-        return outside[:, 0] + self._outside(self._driven(scale)), self.inverse.rank + jnp.sum(opening > OPENING)
+        turning = 0.25 * (plus - minus)
+
+        def opening(rows, columns):
+            block = turning[np.ix_(rows, columns)]
+            return jnp.sum(jnp.abs(jnp.diagonal(pivoted_qr(block).r)) > OPENING)
+
+        opened = jnp.stack([opening(*island) for island in self.configuration.system.topology.islands])
+        return outside[:, 0] + self._outside(self._driven(scale)), self.inverse.rank + opened

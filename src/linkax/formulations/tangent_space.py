@@ -19,7 +19,7 @@ from linkax.equations.loops import gamma, is_driven, jacobian, rate, residual
 from linkax.equations.system import System
 from linkax.formulations.branches import Crossing
 from linkax.formulations.passage import Course, Value, limit
-from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert, with_mass
+from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert_apart, with_mass
 
 ROUNDING_ULPS = 8.0
 MOST_CORRECTIONS = 20
@@ -38,6 +38,18 @@ class Dynamics(NamedTuple):
     rank: Int[Array, ""]
     distance: Float[Array, ""]
     violation: Float[Array, " m"]
+
+
+class Departure(NamedTuple):
+    """A configuration as a crossing of branches, and v̇ at rest there.
+
+    - `mass`: M. `definiteness`: of M on the tangent space, see `linkax.linalg.constrained_solve.Inverse`.
+    """
+
+    crossing: Crossing
+    mass: Float[Array, "n_v n_v"]
+    acceleration: Float[Array, " n_v"]
+    definiteness: Float[Array, ""]
 
 
 class _Instant(NamedTuple):
@@ -61,15 +73,15 @@ class TangentSpace(eqx.Module):
     """Corrections, accelerations and multipliers by the split of the space of speeds.
 
     - `rank_tolerance`: τ; a loop row is independent where |R_kk| > τ max(|R₁₁|, 1).
-    - `rank_nearby`: rank along the motion, where it is known; in a singular configuration the
-      rank itself is smaller.
+    - `rank_nearby`: rank of each island (see `linkax.model.topology.Topology`) along the motion,
+      where it is known; in a singular configuration the rank itself is smaller.
     - `metric`: in which corrections are smallest and normal and tangent space orthogonal:
       "mass" (W = M + JᵀDJ) or "identity" (radians, and lengths of the mechanism).
     - `corrections`: position corrections in each evaluation and after each step.
     """
 
     rank_tolerance: Float[Array, ""]
-    rank_nearby: Int[Array, ""] | None = None
+    rank_nearby: Int[Array, " k"] | None = None
     metric: Literal["mass", "identity"] = eqx.field(static=True, default="mass")
     corrections: int = eqx.field(static=True, default=1)
 
@@ -81,8 +93,9 @@ class TangentSpace(eqx.Module):
 
     def _split(self, instant: _Instant) -> Inverse:
         weight = instant.mass if self.metric == "mass" else None
-        units = instant.configuration.system.units
-        return invert(weight, instant.jacobian, units, self.rank_tolerance, self.rank_nearby)
+        system = instant.configuration.system
+        islands = system.topology.islands
+        return invert_apart(weight, instant.jacobian, system.units, self.rank_tolerance, islands, self.rank_nearby)
 
     def _solve(self, split, instant, f, gamma, sweeps):
         """v̇ and λ of M v̇ = f + Jᵀλ, J v̇ = γ."""
@@ -125,8 +138,9 @@ class TangentSpace(eqx.Module):
     def correct(self, system: System, t, q, v, errors=()):
         """q and v moved onto the manifold, for states close to it, and the distance d there.
 
-        `errors`, arrays (n_v,), are estimates of errors of the state. Of them only the part in the
-        tangent space remains in the state, and only that is returned.
+        `errors`, of q and of v, (n_v,) each, are estimates of errors of the state. Of them only the
+        part in the tangent space remains in the state, and only that is returned; what the
+        correction leaves of the loops open counts as an error of all coordinates.
         """
         if system.topology.num_rows == 0:
             return on_manifold(system.topology, q), v, errors, jnp.ones((), q.dtype)
@@ -135,7 +149,8 @@ class TangentSpace(eqx.Module):
             remaining = split.tangent @ (self._weight(instant) @ jnp.stack(errors, axis=1))
             # The factors are those of the state before its correction.
             remaining = remaining - split.normal @ (instant.jacobian @ remaining)
-            errors = tuple(remaining.T)
+            open_ = _largest(residual(instant.configuration)) * system.units
+            errors = jnp.where(jnp.abs(remaining[:, 0]) < open_, open_, remaining[:, 0]), remaining[:, 1]
         return instant.configuration.q, v, errors, split.distance
 
     @eqx.filter_jit  # traced once, however often a solver asks
@@ -155,14 +170,15 @@ class TangentSpace(eqx.Module):
         instant = _at(system, t, q)
         return Crossing(instant.configuration, instant.jacobian, self._split(instant))
 
-    def departure(self, system: System, t, q):
-        """The configuration as a crossing of branches, and v̇ at rest there."""
+    def departure(self, system: System, t, q) -> "Departure":
+        """What decides where a motion from rest goes."""
         instant = _at(system, t, q)
         split, rest = self._split(instant), jnp.zeros(system.topology.num_speeds, system.dtype)
         inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
         motion = move(instant.configuration, rest)
         acceleration = inverse.tangent @ generalised_force(motion) + inverse.normal @ gamma(motion)
-        return Crossing(instant.configuration, instant.jacobian, split), acceleration
+        crossing = Crossing(instant.configuration, instant.jacobian, split)
+        return Departure(crossing, instant.mass, acceleration, inverse.definiteness)
 
     @eqx.filter_jit
     def dynamics(self, system: System, t, q, v) -> Dynamics:
@@ -177,7 +193,7 @@ class TangentSpace(eqx.Module):
             (_, acceleration), _ = self._limit(_acceleration_at, (0, 2), system, t, q, v)
             _, multipliers = self._solve(split, instant, force, instant.jacobian @ acceleration, sweeps=1)
         violation = instant.jacobian @ acceleration - right
-        return Dynamics(acceleration, multipliers, split.rank, split.distance, violation)
+        return Dynamics(acceleration, multipliers, jnp.sum(split.rank), split.distance, violation)
 
     @eqx.filter_jit
     def close(self, system: System, t, q, v):

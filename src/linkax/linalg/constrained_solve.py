@@ -8,7 +8,9 @@ which serve accelerations and corrections alike.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
@@ -24,6 +26,8 @@ class Inverse(NamedTuple):
     - `rank`: number of independent rows.
     - `distance` d: |R_rr| / |R₁₁|, r the rank here or that of the neighbourhood where it is
       known; falls to zero in a singular configuration. One without rows.
+    - `definiteness`: of W: the smallest of the squared diagonal of its Cholesky factor over its own
+      diagonal; rounding or not a number where the mass matrix is singular on the tangent space.
     """
 
     tangent: Float[Array, "n n"]
@@ -32,6 +36,7 @@ class Inverse(NamedTuple):
     basis: Float[Array, "n n"]
     rank: Int[Array, ""]
     distance: Float[Array, ""]
+    definiteness: Float[Array, ""]
 
 
 def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
@@ -53,17 +58,22 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     dtype, jacobian = jacobian.dtype, jacobian * units[None, :]
     size = jnp.sqrt(jnp.sum(jacobian**2, axis=1))
     added = jnp.zeros(rows, dtype)
-    to_metric = jnp.eye(n, dtype=dtype)
+    to_metric, definiteness = jnp.eye(n, dtype=dtype), jnp.ones((), dtype)
     if weight is not None:
         weight = weight * units[:, None] * units[None, :]
         # W = M + JᵀDJ is positive definite where M is so on the tangent space only.
         # A row of rounding alone would add as much as any other, and is left out.
         square = jnp.where(size > tolerance * jnp.max(size, initial=0.0), size**4, 0.0)
-        added = _ratio(jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1), square, 0.0)
-        to_metric = _lower_inverse(weight + (jacobian.T * added) @ jacobian)
+        moved = jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1)
+        # A row that moves massless bodies alone takes the largest mass that there is.
+        moved = jnp.where(moved > 0.0, moved, jnp.max(jnp.diagonal(weight), initial=0.0) * size**2)
+        added = _ratio(moved, square, 0.0)
+        to_metric, definiteness = _lower_inverse(weight + (jacobian.T * added) @ jacobian)
     if rows == 0:
         tangent, nothing = to_metric.T * units[:, None], jnp.zeros((n, 0), dtype)
-        return Inverse(tangent @ tangent.T, nothing, nothing[:0], tangent, jnp.zeros((), int), jnp.ones((), dtype))
+        return Inverse(
+            tangent @ tangent.T, nothing, nothing[:0], tangent, jnp.zeros((), int), jnp.ones((), dtype), definiteness
+        )
 
     weighted = to_metric @ jacobian.T
     scale = _ratio(size, jnp.sqrt(jnp.sum(weighted**2, axis=0)), 1.0)
@@ -92,7 +102,50 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
         basis=tangent,
         rank=rank,
         distance=jnp.where(last >= 0, _ratio(smallest, diagonal[0], 0.0), 1.0),
+        definiteness=definiteness,
     )
+
+
+def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) -> Inverse:
+    """Like `invert`, for a system that falls apart: each island (rows, columns) by itself.
+
+    Islands of one shape are inverted together, in one batch. `rank_nearby` is given, and `rank`
+    returned, for each island, (k,); `distance` and `definiteness` are the smallest.
+    """
+    (m, n), dtype = jacobian.shape, jacobian.dtype
+    if len(islands) == 1:
+        found = invert(weight, jacobian, units, tolerance, None if rank_nearby is None else rank_nearby[0])
+        return found._replace(rank=found.rank[None])
+    by_shape = {}
+    for index, (rows, columns) in enumerate(islands):
+        by_shape.setdefault((len(rows), len(columns)), []).append((index, rows, columns))
+    whole = Inverse(
+        tangent=jnp.zeros((n, n), dtype),
+        normal=jnp.zeros((n, m), dtype),
+        compliance=jnp.zeros((m, m), dtype),
+        basis=jnp.zeros((n, n), dtype),
+        rank=jnp.zeros(len(islands), int),
+        distance=jnp.ones((), dtype),
+        definiteness=jnp.ones((), dtype),
+    )
+    for members in by_shape.values():
+        index, rows, columns = (np.array(part, dtype=int) for part in zip(*members, strict=True))
+        across, down, up = columns[:, None, :], columns[:, :, None], rows[:, :, None]
+        blocks = None if weight is None else weight[down, across]
+        ranks = None if rank_nearby is None else rank_nearby[index]
+        inputs = blocks, jacobian[up, across], units[columns], tolerance, ranks
+        axes = [None if blocks is None else 0, 0, 0, None, None if ranks is None else 0]
+        found = jax.vmap(invert, in_axes=axes)(*inputs)
+        whole = Inverse(
+            tangent=whole.tangent.at[down, across].set(found.tangent),
+            normal=whole.normal.at[down, rows[:, None, :]].set(found.normal),
+            compliance=whole.compliance.at[up, rows[:, None, :]].set(found.compliance),
+            basis=whole.basis.at[down, across].set(found.basis),
+            rank=whole.rank.at[index].set(found.rank),
+            distance=jnp.minimum(whole.distance, jnp.min(found.distance)),
+            definiteness=jnp.minimum(whole.definiteness, jnp.min(found.definiteness)),
+        )
+    return whole
 
 
 def with_mass(inverse: Inverse, mass) -> Inverse:
@@ -100,10 +153,12 @@ def with_mass(inverse: Inverse, mass) -> Inverse:
     mass = lax.stop_gradient(mass)
     basis = inverse.basis
     empty = jnp.diag((jnp.sum(basis**2, axis=0) == 0.0).astype(mass.dtype))
-    root = _lower_inverse(basis.T @ mass @ basis + empty) @ basis.T
+    to_basis, definiteness = _lower_inverse(basis.T @ mass @ basis + empty)
+    root = to_basis @ basis.T
     tangent = root.T @ root
     normal = inverse.normal - tangent @ (mass @ inverse.normal)
-    return inverse._replace(tangent=tangent, normal=normal, compliance=inverse.normal.T @ mass @ normal)
+    compliance = inverse.normal.T @ mass @ normal
+    return inverse._replace(tangent=tangent, normal=normal, compliance=compliance, definiteness=definiteness)
 
 
 def _ratio(a, b, otherwise):
@@ -111,9 +166,10 @@ def _ratio(a, b, otherwise):
 
 
 def _lower_inverse(matrix):
-    """L⁻¹ of a positive definite matrix L Lᵀ."""
+    """L⁻¹ of a positive definite matrix L Lᵀ, and its definiteness (see `Inverse`)."""
     lower = jnp.linalg.cholesky(matrix, symmetrize_input=False)
-    return solve_triangular(lower, jnp.eye(matrix.shape[0], dtype=matrix.dtype), lower=True)
+    definiteness = jnp.min(_ratio(jnp.diagonal(lower) ** 2, jnp.diagonal(matrix), 0.0), initial=1.0)
+    return solve_triangular(lower, jnp.eye(matrix.shape[0], dtype=matrix.dtype), lower=True), definiteness
 
 
 def apply(inverse: Inverse, f, gamma):

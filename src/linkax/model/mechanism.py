@@ -70,6 +70,7 @@ class Mechanism(eqx.Module):
             joint_types=tuple(type(joint) for joint in self.joints),
             **split_rows(carriers, predecessors, cuts),
             constraints=tuple(constraint.name for constraint in constraints),
+            constraint_terms=tuple(constraint.terms for constraint in constraints),
         )
 
     def body(self, name: str) -> RigidBody:

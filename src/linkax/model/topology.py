@@ -3,6 +3,7 @@
 import dataclasses
 from collections import deque
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,13 @@ from linkax.model.joints.joint import AbstractJoint
 from linkax.model.terms import Term
 
 GROUND_INDEX = -1
+
+
+class Island(NamedTuple):
+    """A part of a mechanism that moves independently of the rest: its loop rows and its speeds."""
+
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +35,8 @@ class Topology:
       (cut joint, i) of each loop row h₁ⁱ·s; cut joints and axes counted from 0. Rows that
       vanish identically are left out here, and kept in `immobile_rotation_rows` and
       `immobile_translation_rows`.
-    - `constraints`: names of the constraints on coordinates of the tree, a row each.
+    - `constraints`: names of the constraints on coordinates of the tree, a row each, and
+      `constraint_terms`: whose coordinates each one relates.
 
     Rows of the loop constraints: rotation rows, translation rows, a combined row for each cut
     joint whose type has one, and those of `constraints`.
@@ -44,6 +53,7 @@ class Topology:
     immobile_rotation_rows: tuple[tuple[int, int, int], ...]
     immobile_translation_rows: tuple[tuple[int, int], ...]
     constraints: tuple[str, ...] = ()
+    constraint_terms: tuple[tuple[Term, ...], ...] = ()
 
     @property
     def num_bodies(self) -> int:
@@ -123,6 +133,24 @@ class Topology:
         """Which speeds are of lengths [m/s], shape (n_v,)."""
         kinds = self.joint_types[: self.num_bodies]
         return np.array([unit == "m" for kind in kinds for unit in kind.speed_units], dtype=bool)
+
+    @cached_property
+    def islands(self) -> tuple["Island", ...]:
+        """Parts of the mechanism that neither a loop nor an inertia connects, in the order of their speeds."""
+        of_joints = [np.flatnonzero(moved) for moved in self.loop[:, self.column_body]]
+        of_constraints = [np.array([self.column(term) for term in terms]) for terms in self.constraint_terms]
+        plain = [cut for cut, *_ in (*self.rotation_rows, *self.translation_rows)]
+        of_rows = [of_joints[cut] for cut in (*plain, *self.combining)] + of_constraints
+        carried = [np.flatnonzero(on_path[self.column_body]) for on_path in self.path[:-1]]
+
+        label = np.arange(self.num_speeds)
+        for together in (*carried, *of_rows):
+            label[np.isin(label, label[together])] = np.min(label[together], initial=self.num_speeds)
+        row_label = np.array([label[columns[0]] if len(columns) else 0 for columns in of_rows], dtype=int)
+        return tuple(
+            Island(tuple(np.flatnonzero(row_label == part)), tuple(np.flatnonzero(label == part)))
+            for part in np.unique(label)
+        )
 
     @cached_property
     def reversed(self) -> np.ndarray:

@@ -15,20 +15,22 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.simulation.state import State
 
 MOVES = 1e-6  # of the largest speed
+SINGULAR_ULPS = 8.0  # times the number of speeds: what rounding leaves of a singular mass matrix
 ON_BRANCH = 10.0  # rank tolerances that speeds may be off a branch, relative to their square
 
 
 class Outset(NamedTuple):
     """A state that motion starts from, put on the closed loops.
 
-    - `rank`: of J at the states next to it along the motion.
-    - `finite`, `closed`; `on_branch`: the speeds lie on a branch of the motion; `unique`: so
-      does, at rest, the acceleration.
+    - `rank`: of J at the states next to it along the motion, for each island of the mechanism.
+    - `finite`, `closed`; `massive`: all that can move has mass; `on_branch`: the speeds lie on a
+      branch of the motion; `unique`: so does, at rest, the acceleration.
     """
 
     state: State
-    rank: Int[Array, ""]
+    rank: Int[Array, " k"]
     finite: Bool[Array, ""]
+    massive: Bool[Array, ""]
     closed: Bool[Array, ""]
     on_branch: Bool[Array, ""]
     unique: Bool[Array, ""]
@@ -36,7 +38,7 @@ class Outset(NamedTuple):
     @property
     def sound(self) -> Bool[Array, ""]:
         """Motion can start from here."""
-        return self.finite & self.closed & self.on_branch & self.unique
+        return self.finite & self.massive & self.closed & self.on_branch & self.unique
 
 
 def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
@@ -47,16 +49,21 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     """
     q, v = method.close(system, t, state.q, state.v)
     start = State(q, v)
-    if system.topology.num_rows == 0:
-        finite, true = jnp.all(jnp.isfinite(jnp.concatenate([q, v]))), jnp.ones((), bool)
-        return Outset(start, jnp.zeros((), int), finite, true, true, true)
     # All that follows only decides, and has no derivative.
-    method, system, t, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, q, v))
-    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
-    crossing, acceleration = method.departure(system, t, q)
+    method, system, t, given, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, state.q, q, v))
+    # A singular mass matrix has spoiled them.
+    q, v = jnp.where(jnp.all(jnp.isfinite(q)), q, given), jnp.where(jnp.isfinite(v), v, 0.0)
+    crossing, mass, acceleration, definiteness = method.departure(system, t, q)
+    eps = jnp.finfo(system.dtype).eps
+    massive = definiteness > SINGULAR_ULPS * eps * len(v)
+    finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & jnp.all(jnp.isfinite(mass))
+    finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, acceleration, 0.0)))
+    if system.topology.num_rows == 0:
+        true = jnp.ones((), bool)
+        return Outset(start, crossing.inverse.rank, finite, massive, true, true, true)
     gap = gaps(crossing.configuration)
-    small = jnp.sqrt(jnp.finfo(system.dtype).eps)
-    at_rest = crossing.fastest(v) ** 2 <= jnp.finfo(system.dtype).eps * crossing.fastest(acceleration)
+    small = jnp.sqrt(eps)
+    at_rest = crossing.fastest(v) ** 2 <= eps * crossing.fastest(acceleration)
     off, rank = crossing.along(jnp.where(at_rest, acceleration, v))
     # Rows that are not quite dependent contradict each other by as much.
     on_branch = jnp.max(jnp.abs(off), initial=0.0) <= ON_BRANCH * method.rank_tolerance
@@ -64,6 +71,7 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
         state=start,
         rank=rank,
         finite=finite,
+        massive=massive,
         closed=jnp.all(gap.distance <= small * system.length)
         & jnp.all(gap.angle <= small)
         & jnp.all(gap.constraints <= small * system.coupling_unit),

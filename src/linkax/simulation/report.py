@@ -14,6 +14,7 @@ KNOWN_RESULTS = (
     "not_closed",
     "no_branch",
     "not_unique",
+    "massless",
     "not_finite",
 )
 

@@ -18,7 +18,11 @@ class RESULTS(diffrax.RESULTS):
         "The mechanism starts at rest in a singular configuration, and the forces drive it along no single branch: "
         "its motion is not unique. Give it speeds, or start a little along the branch it should take."
     )
-    not_finite = "The initial state or the numbers of the mechanism are not finite."
+    massless = (
+        "Bodies without mass, or without inertia, can move freely, so that no acceleration follows from the forces on "
+        "them. Give them mass and inertia, or a joint that holds them."
+    )
+    not_finite = "The initial state, the numbers of the mechanism, or its forces there are not finite."
 
 
 class SimulationError(RuntimeError):

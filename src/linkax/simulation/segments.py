@@ -100,7 +100,7 @@ def _joined(parts) -> Solution:
         q=_thinned(parts, "q"),
         v=_thinned(parts, "v"),
         stats=parts[-1].stats | counted,
-        rank_nearby=max(part.rank_nearby for part in parts),
+        rank_nearby=np.max([part.rank_nearby for part in parts], axis=0),
         closest=min(part.closest for part in parts),
     )
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from linkax.equations.system import system_of
-from linkax.formulations.branches import Crossing
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.accuracy import BALANCED, Accuracy
+from linkax.simulation.diagnosis import cause
 from linkax.simulation.integration import MechanismControl, Problem, Projected
-from linkax.simulation.outset import depart, moving_joints
+from linkax.simulation.outset import depart
 from linkax.simulation.results import RESULTS, SimulationError
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
@@ -251,18 +251,14 @@ def _result(result, outset):
     result = RESULTS.where(outset.unique, result, RESULTS.not_unique)
     result = RESULTS.where(outset.on_branch, result, RESULTS.no_branch)
     result = RESULTS.where(outset.closed, result, RESULTS.not_closed)
+    result = RESULTS.where(outset.massive, result, RESULTS.massless)
     return RESULTS.where(outset.finite, result, RESULTS.not_finite)
 
 
 def _raise_if_failed(solution, state):
     if (solution.result == RESULTS.successful) | (solution.result == RESULTS.event_occurred):
         return
-    at_start = (RESULTS.not_finite, RESULTS.not_closed, RESULTS.no_branch, RESULTS.not_unique)
-    when = "before it began" if any(solution.result == r for r in at_start) else f"at t = {float(solution.t_end):.6g} s"
-    reason = f"simulation stopped {when}: {RESULTS[solution.result]}"
-    if (solution.result == RESULTS.no_branch) | (solution.result == RESULTS.not_unique):
-        method, system = solution.accuracy.method(state.q.dtype), system_of(solution.mechanism, state.q.dtype)
-        crossing = Crossing.at(system, solution.t_end, state.q, method.rank_tolerance)
-        names = moving_joints(system, solution.t_end, state.q, crossing.inverse.basis)
-        reason += f" The branches cross in the motion of joints {', '.join(map(repr, names))}."
-    raise SimulationError(reason, solution)
+    at_start = ("not_finite", "massless", "not_closed", "no_branch", "not_unique")
+    before = any(solution.result == getattr(RESULTS, name) for name in at_start)
+    when = "before it began" if before else f"at t = {float(solution.t_end):.6g} s"
+    raise SimulationError(f"simulation stopped {when}: {RESULTS[solution.result]}{cause(solution, state)}", solution)

@@ -69,7 +69,8 @@ class Solution(eqx.Module):
     - `t_end`, `end`: the time reached and the `State` there.
     - `stats`: as in diffrax: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `result`: a `linkax.RESULTS`; equal to `RESULTS.successful` where all went well.
-    - `rank_nearby`: rank along the motion; in a singular configuration `rank` is smaller.
+    - `rank_nearby`: rank along the motion, of each part that moves independently of the others, (k,);
+      in a singular configuration `rank` is smaller than their sum.
     - `closest`: smallest distance from a singular configuration at any stage of any step.
 
     All that is read by the methods below comes as arrays with times as the first axis, in ground
@@ -86,7 +87,7 @@ class Solution(eqx.Module):
     end: State
     stats: dict[str, Any]
     result: RESULTS
-    rank_nearby: Int[Array, "*batch"]
+    rank_nearby: Int[Array, "*batch k"]
     closest: Float[Array, "*batch"]
     interpolation: Any
 

@@ -1,0 +1,116 @@
+"""Why a simulation failed: the elements to blame, found on the host after the run."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.equations.dynamics import mass_matrix
+from linkax.equations.kinematics import configure, move
+from linkax.equations.loops import gaps, jacobian, residual
+from linkax.equations.system import system_of
+from linkax.formulations.branches import Crossing
+from linkax.linalg.constrained_solve import invert
+from linkax.model.constraints import Drive
+from linkax.simulation.outset import MOVES, moving_joints
+from linkax.simulation.results import RESULTS
+
+AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
+NULL = 1e-10  # eigenvalue of a mass matrix of ones
+
+
+def cause(solution, state) -> str:
+    """A sentence that names the elements at fault, or nothing where none is found.
+
+    **Arguments:** a failed `Solution`, and the `State` that it was to start from.
+    """
+    system = system_of(solution.mechanism, state.q.dtype)
+    method = solution.accuracy.method(state.q.dtype)
+    result, t = solution.result, solution.t_end
+    if result == RESULTS.not_finite:
+        return _not_finite(solution.mechanism) or _forces(solution, system, t, state)
+    if result == RESULTS.not_closed:
+        return _open(system, solution.mechanism, t, method.close(system, t, state.q, state.v)[0])
+    if result == RESULTS.massless:
+        return f" They are {_listed(_massless_bodies(system, method, t, state.q))}."
+    if (result == RESULTS.no_branch) | (result == RESULTS.not_unique):
+        basis = Crossing.at(system, t, state.q, method.rank_tolerance).inverse.basis
+        return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
+    return _drives(solution, system, t) or _ahead(solution, system, t)
+
+
+def _listed(names):
+    return ", ".join(map(repr, names)) or "none"
+
+
+def _not_finite(mechanism):
+    for path, leaf in jax.tree_util.tree_flatten_with_path(mechanism)[0]:
+        if eqx.is_inexact_array(leaf) and not np.all(np.isfinite(leaf)):
+            place, which, *rest = path
+            owner = getattr(getattr(mechanism, place.name)[which.idx], "name", type(leaf).__name__)
+            return f" {owner!r}{jax.tree_util.keystr(rest)} is {np.asarray(leaf).tolist()}."
+    return ""
+
+
+def _forces(solution, system, t, state):
+    """Force elements whose load is not finite."""
+    motion = move(configure(system, jnp.asarray(t), state.q), state.v)
+    for force in solution.mechanism.forces:
+        load = force.load(jnp.asarray(t), motion)
+        if not all(bool(jnp.all(jnp.isfinite(part))) for part in load):
+            return f" The load of {force.described} is not finite at t = {float(t):.6g} s."
+    return ""
+
+
+def _ahead(solution, system, t):
+    """The same a little after the end of the run, where its last step failed."""
+    for ahead in AHEAD * float(jnp.max(jnp.abs(t)) + 1.0):
+        if found := _forces(solution, system, t + ahead, solution.end):
+            return found
+    return ""
+
+
+def _drives(solution, system, t):
+    """Drives that ask for what the loops do not allow just after the end of the run."""
+    drives = [constraint for constraint in solution.mechanism.constraints if isinstance(constraint, Drive)]
+    method, end = solution.accuracy.method(system.dtype, solution.rank_nearby), solution.end
+    small = jnp.sqrt(jnp.finfo(system.dtype).eps)
+    for ahead in AHEAD * float(jnp.abs(t) + 1.0) if drives else ():
+        q, _ = method.close(system, t + ahead, end.q, end.v)
+        if not float(jnp.max(jnp.abs(residual(configure(system, t + ahead, q))))) < small:
+            asked = [f"{drive.described} of joint {drive.joints[0]!r}" for drive in drives]
+            return f" The {' and the '.join(asked)} asks for what the loops do not allow after t = {float(t):.6g} s."
+    return ""
+
+
+def _open(system, mechanism, t, q):
+    """Where the loops are open, widest first."""
+    gap, topology = gaps(configure(system, t, q)), mechanism.topology
+    names = [*topology.joints[topology.num_bodies :], *topology.constraints]
+    sizes = np.concatenate(
+        [np.maximum(gap.distance / system.length, gap.angle), gap.constraints / system.coupling_unit]
+    )
+    widest = int(np.argmax(sizes))
+    return f" Joint {names[widest]!r} is open by {sizes[widest]:.3g}, in radians or lengths of the mechanism."
+
+
+def _massless_bodies(system, method, t, q):
+    """Bodies that can move without moving any mass: magnitudes of masses do not matter, so all are one."""
+    weigh = lambda numbers, size: jnp.where(size > 0.0, numbers / jnp.where(size > 0.0, size, 1.0), 0.0)
+    moment = jnp.max(jnp.abs(system.inertia), axis=(1, 2))
+    inertia = weigh(system.inertia, moment[:, None, None]) * system.length**2
+    equal = eqx.tree_at(lambda s: (s.mass, s.inertia), system, (weigh(system.mass, system.mass), inertia))
+    configuration = configure(equal, t, q)
+    basis = invert(None, jacobian(configuration), system.units, method.rank_tolerance).basis
+    basis = np.asarray(basis)[:, np.any(np.asarray(basis) != 0.0, axis=0)]
+    values, vectors = np.linalg.eigh(basis.T @ np.asarray(mass_matrix(configuration)) @ basis / system.length**2)
+    directions = basis @ vectors[:, values < NULL]
+    found = []
+    for direction in directions.T:
+        motion = move(configuration, jnp.asarray(direction))
+        speed = np.linalg.norm(motion.angular_velocity[:-1], axis=1)
+        speed += np.linalg.norm(motion.velocity[:-1], axis=1) / float(system.length)
+        found += [
+            name for name, moves in zip(system.topology.bodies, speed > MOVES * np.max(speed), strict=True) if moves
+        ]
+    return list(dict.fromkeys(found))
