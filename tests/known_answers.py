@@ -1,10 +1,14 @@
 """Answers from elsewhere: the files in `data`, and closed forms."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
+import diffrax
 import numpy as np
 from scipy.special import ellipj, ellipk
 
+import linkax as lx
 from linkax.scenes import SCENES
 
 
@@ -28,3 +32,85 @@ def n_four_bar(times, count, gravity=9.81):
     m = 4 * c / (1 + 4 * c)
     sn, cn, _, _ = ellipj(times / 2 * np.sqrt(1 + 4 * c) - ellipk(m), m)
     return np.stack([-2 * cn * sn, 1 - 2 * cn**2], axis=-1)
+
+
+class Known(NamedTuple):
+    """A run whose motion is known.
+
+    - `scene`, `variant`, `changes`: see `start`; `t1` [s].
+    - `error`: of a solution at its times [m or rad], (n_t,).
+    - `times`: where the answer is known; None for 201 times, evenly.
+    """
+
+    scene: str
+    variant: str | None
+    changes: dict | None
+    t1: float
+    error: Callable
+    times: np.ndarray | None = None
+
+    def simulate(self, **options):
+        saveat = None if self.times is None else diffrax.SaveAt(ts=self.times)
+        return lx.simulate(*start(self.scene, self.variant, self.changes), t1=self.t1, saveat=saveat, **options)
+
+
+def _crank_slider(variant):
+    known = reference(f"crank_slider_{variant}")
+    error = lambda found: np.abs(found.position("slider")[:, 0] - known["x_slider"])
+    return Known("crank-slider", variant, None, 5.0, error)
+
+
+def _circle(found, angle):
+    turn = np.asarray(found.ts) + angle
+    return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+
+
+def _four_bar(changes, exact, t1=10.0):
+    error = lambda found: np.linalg.norm(found.position("link_0", at="tip")[:, :2] - exact(found), axis=-1)
+    return Known("n-four-bar", "A02", changes, t1, error)
+
+
+def _four_link(variant):
+    def exact(found):
+        if variant == "FL3":
+            return n_four_bar(found.ts, 1)
+        return _circle(found, np.pi / 2 if variant == "FL1" else 0.0)
+
+    def error(found):
+        place = found.position("coupler", at="tip")[:, :2] - np.array([1.0, 0.0])
+        return np.linalg.norm(place - exact(found), axis=-1)
+
+    return Known("spatial-four-link", variant, None, 20.0, error)
+
+
+def _bricard():
+    known = reference("A04_bricard")
+    exact = np.stack([known[f"P3{axis}"] for axis in "xyz"], axis=-1)
+    error = lambda found: np.linalg.norm(found.position("rod_2", at="tip") - exact, axis=-1)
+    return Known("bricard", "A04", None, 10.0, error, known["t"])
+
+
+def _crane():
+    known = reference("luffing_telescopic_crane_rigid")
+
+    def error(found):
+        angle, extension = found.joint("boom") - known["alpha"], found.joint("slide_2") - 1.0 - known["e"]
+        return np.maximum(np.abs(angle), np.abs(extension))
+
+    return Known("rigid-crane", None, None, 5.0, error, known["t"])
+
+
+def _planar_four_bar():
+    known = reference("planar_four_bar_particles")
+    error = lambda found: np.abs(found.joint("P1") - known["q1"])
+    return Known("planar-four-bar", None, None, 30.0, error, known["t"])
+
+
+# Through singular configurations.
+PASSING = {f"SC{i}": _crank_slider(f"SC{i}") for i in (1, 2, 3, 4)}
+PASSING["FL1"] = _four_bar({"N": 1, "gravity": 0.0, "speed": 1.0}, lambda found: _circle(found, np.pi / 2))
+PASSING["FL2"] = _four_bar({"N": 1, "gravity": 0.0, "speed": 1.0, "angle": 0.0}, lambda found: _circle(found, 0.0))
+PASSING |= {f"A02-{n}": _four_bar({"N": n}, lambda found, n=n: n_four_bar(found.ts, n)) for n in (1, 2, 5, 10)}
+# With constraints that are redundant all the time, couplings, bodies without mass.
+REDUNDANT = {f"spatial {variant}": _four_link(variant) for variant in ("FL1", "FL2", "FL3")}
+REDUNDANT |= {"bricard": _bricard(), "rigid-crane": _crane(), "planar-four-bar": _planar_four_bar()}

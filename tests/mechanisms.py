@@ -1,5 +1,7 @@
 """A pool of mechanisms for laws that hold for all of them."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +22,18 @@ def crank_slider(cut=None, order=1, offset=(0.0, 0.0, 0.0), rod=1.3):
         lx.Prismatic("guide", lx.GROUND.at(offset), slider, axis="x", **options("guide")),
     ]
     return lx.Mechanism([crank, link, slider], joints[::order], [lx.Gravity([0.0, -9.81, 0.0])])
+
+
+def with_cut(mechanism, name):
+    """The same mechanism with another joint cut."""
+
+    def again(joint):
+        joint = copy.copy(joint)
+        object.__setattr__(joint, "cut", joint.name == name)
+        return joint
+
+    joints = [again(joint) for joint in mechanism.joints]
+    return lx.Mechanism(mechanism.bodies, joints, mechanism.forces, mechanism.constraints)
 
 
 class Numbers:

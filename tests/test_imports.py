@@ -8,7 +8,8 @@ import pytest
 import linkax
 
 SOURCE = Path(linkax.__file__).parent
-LAYERS = ["spatial", "model", "linalg", "equations", "formulations", "simulation", "scenes", "plotting", "cli"]
+LAYERS = ["spatial", "model", "linalg", "equations", "formulations", "simulation", "analysis"]
+LAYERS += ["scenes", "plotting", "cli"]
 
 
 def layer(module):

@@ -9,6 +9,14 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from linkax.analysis.inverse_dynamics import InverseDynamics as InverseDynamics  # noqa: E402
+from linkax.analysis.inverse_dynamics import inverse_dynamics as inverse_dynamics  # noqa: E402
+from linkax.analysis.mobility import Mobility as Mobility  # noqa: E402
+from linkax.analysis.mobility import mobility as mobility  # noqa: E402
+from linkax.analysis.vibration import EquilibriumError as EquilibriumError  # noqa: E402
+from linkax.analysis.vibration import Linearisation as Linearisation  # noqa: E402
+from linkax.analysis.vibration import equilibrium as equilibrium  # noqa: E402
+from linkax.analysis.vibration import linearise as linearise  # noqa: E402
 from linkax.equations.kinematics import Motion as Motion  # noqa: E402
 from linkax.equations.reactions import Reaction as Reaction  # noqa: E402
 from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402

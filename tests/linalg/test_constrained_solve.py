@@ -10,7 +10,14 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from linkax.linalg.constrained_solve import apply, constrained_solve, invert, with_mass
+from linkax.linalg.constrained_solve import (
+    apply,
+    constrained_solve,
+    invert,
+    invert_apart,
+    least_multipliers,
+    with_mass,
+)
 
 TOLERANCE = 1e-10
 METRICS = ["mass", "identity"]
@@ -250,3 +257,43 @@ def error_after(chosen, metric, sweeps, away):
     inverse = inverted(metric, *nearby, UNITS[len(mass)])
     exact = constrained_solve(inverted(metric, mass, jacobian, UNITS[len(mass)]), mass, jacobian, f, gamma, 3)[0]
     return np.max(np.abs(constrained_solve(inverse, mass, jacobian, f, gamma, sweeps)[0] - exact))
+
+
+@pytest.mark.parametrize("metric", ["mass", "identity"])
+def test_islands_are_inverted_as_in_one(metric):
+    generator = np.random.default_rng(3)
+    islands = (((0, 3), (0, 2, 5)), ((1, 4), (1, 6, 7)), ((2,), (3, 4)))
+    jacobian, mass = np.zeros((5, 8)), np.zeros((8, 8))
+    for rows, columns in islands:
+        jacobian[np.ix_(rows, columns)] = generator.normal(size=(len(rows), len(columns)))
+        root = generator.normal(size=(len(columns), len(columns)))
+        mass[np.ix_(columns, columns)] = root @ root.T + np.eye(len(columns))
+    jacobian[4] = 2.0 * jacobian[1]
+    weight = jnp.array(mass) if metric == "mass" else None
+    arguments = weight, jnp.array(jacobian), jnp.ones(8), 1e-10
+    whole, apart = invert(*arguments), invert_apart(*arguments, islands)
+    np.testing.assert_array_equal(apart.rank, [2, 1, 1])
+    assert whole.rank == 4
+    np.testing.assert_allclose(apart.tangent, whole.tangent, atol=1e-12)
+    # Which of dependent rows is taken may differ, but not what J, normal and right sides in its range give.
+    np.testing.assert_allclose(apart.normal @ jacobian, whole.normal @ jacobian, atol=1e-12)
+    known = invert_apart(*arguments, islands, jnp.array([2, 1, 1]))
+    np.testing.assert_allclose(known.normal, apart.normal, atol=1e-14)
+
+
+def test_least_multipliers_are_smallest_and_differentiable():
+    generator = np.random.default_rng(4)
+    basic, mix = generator.normal(size=(2, 4)), generator.normal(size=(5, 2))
+    jacobian = lambda s: jnp.array(mix) @ (jnp.array(basic) * (1.0 + s))
+    given = jnp.array(generator.normal(size=5))
+    found = least_multipliers(jacobian(0.0), given, jnp.ones(4), 1e-10, 2)
+    exact = lambda s: jnp.linalg.pinv(jacobian(s).T) @ (jacobian(s).T @ given)
+    np.testing.assert_allclose(found.multipliers, exact(0.0), atol=1e-12)
+    free = np.asarray(found.free)
+    assert np.sum(np.any(np.abs(free) > 0.0, axis=0)) == 3
+    np.testing.assert_allclose(jacobian(0.0).T @ free, 0.0, atol=1e-12)
+    rows = lambda s: jnp.array(mix) @ (jnp.array(basic) + s * jnp.array(basic[::-1]))
+    of = lambda s: least_multipliers(rows(s), given, jnp.ones(4), 1e-10, 2).multipliers
+    pinned = lambda s: jnp.linalg.pinv(rows(s).T) @ (rows(s).T @ given)
+    difference = (pinned(1e-6) - pinned(-1e-6)) / 2e-6
+    np.testing.assert_allclose(jax.jacfwd(of)(0.0), difference, atol=1e-7)

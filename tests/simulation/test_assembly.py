@@ -87,3 +87,52 @@ def test_derivative_of_an_assembled_state():
     speed = lambda *numbers: lx.assemble(crank_slider(*numbers[:2]), {"bearing": numbers[2]}, {"bearing": 1.0}).v[1]
     known = jax.grad(lambda crank, rod, angle: jax.grad(exact, 2)(crank, rod, angle), (0, 1, 2))(*numbers)
     np.testing.assert_allclose(jax.grad(speed, (0, 1, 2))(*numbers), known, rtol=1e-10)
+
+
+def test_a_search_that_is_stuck_starts_again_beside():
+    """The tip has to go to where the bar points away from, a saddle of the gap."""
+    bar = lx.rod("bar", 1.0, 1.0)
+    hinge, ball = (
+        lx.Revolute("hinge", lx.GROUND, bar.at("base"), "z"),
+        lx.Spherical("ball", lx.GROUND.at([-1.0, 0.0, 0.0]), bar.at("tip"), cut=True),
+    )
+    state = lx.assemble(lx.Mechanism([bar], [hinge, ball]))
+    np.testing.assert_allclose(np.abs(state.q), np.pi, atol=1e-12)
+
+
+def test_axes_that_point_opposite_ways_are_no_solution():
+    """Locked rotations vanish for flipped axes too; the guess is nearer to those."""
+    arm, block = lx.rod("arm", 1.0, 1.0), lx.box("block", [0.1, 0.1, 0.1], 1.0)
+    joints = [
+        lx.Universal("cross", lx.GROUND, arm.at("base"), "z", second_axis="y"),
+        lx.Spherical("ball", arm.at("tip"), block),
+        lx.Prismatic("guide", lx.GROUND, block, "x", cut=True),
+    ]
+    flipped = [0.05, 0.0, 0.0, 1.0]
+    state = lx.assemble(lx.Mechanism([arm, block], joints), guess={"cross": [0.3, 0.2], "ball": flipped})
+    mechanism = lx.Mechanism([arm, block], joints)
+    np.testing.assert_allclose(lx.Solution.of_state(mechanism, state).orientation("block")[0], np.eye(3), atol=1e-9)
+
+
+def test_a_ball_is_held_where_it_is_asked_and_turns_as_asked():
+    body = lx.box("body", [1.0, 2.0, 3.0], 1.0)
+    mechanism = lx.Mechanism([body], [lx.Spherical("ball", lx.GROUND, body)])
+    turned = np.array([1.0, 0.5, -0.3, 0.2])
+    state = lx.assemble(mechanism, {"ball": turned}, {"ball": [0.1, 0.2, 0.3]})
+    np.testing.assert_allclose(state.q, turned / np.linalg.norm(turned), atol=1e-14)
+    np.testing.assert_allclose(state.v, [0.1, 0.2, 0.3], atol=1e-14)
+    with pytest.raises(ValueError, match=r"position of joint 'ball' has a quaternion of zeros"):
+        lx.assemble(mechanism, {"ball": np.zeros(4)})
+    with pytest.raises(ValueError, match=r"position of joint 'ball' is one number; the joint has 4"):
+        lx.assemble(mechanism, {"ball": 0.1})
+
+
+def test_rods_that_cannot_make_a_triangle():
+    near, far = lx.rod("near", 1.0, 1.0), lx.rod("far", 1.0, 1.0)
+    joints = [
+        lx.Revolute("left", lx.GROUND, near.at("base"), "z"),
+        lx.Revolute("right", lx.GROUND.at([3.0, 0.0, 0.0]), far.at("base"), "z"),
+        lx.Revolute("top", near.at("tip"), far.at("tip"), "z"),
+    ]
+    with pytest.raises(lx.AssemblyError, match=r"joint 'top' does not close: a gap of 1 m remains"):
+        lx.assemble(lx.Mechanism([near, far], joints))

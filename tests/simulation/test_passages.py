@@ -33,7 +33,7 @@ def test_passages_are_told(variant):
 
 
 def test_a_start_in_a_singular_configuration_is_at_distance_zero():
-    mechanism, state = start("n-four-bar", "FL2")
+    mechanism, state = start("n-four-bar", "A02", {"N": 1, "gravity": 0.0, "speed": 1.0, "angle": 0.0})
     found = lx.simulate(mechanism, state, t1=10.0)
     assert found.rank_nearby == [2]
     assert found.rank()[0] == 1

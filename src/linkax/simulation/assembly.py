@@ -59,7 +59,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     raised; `linkax.simulate` marks such a state in its result.
     """
     positions, guess = _coordinates(mechanism, positions, "position"), _coordinates(mechanism, guess, "guess")
-    speeds = _by_joint(mechanism, speeds, "speed", lambda joint: len(joint.speed_units))
+    speeds = by_joint(mechanism, speeds, "speed", lambda joint: len(joint.speed_units))
     for name in guess:
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
@@ -70,14 +70,15 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
 
 
 def _coordinates(mechanism, values, what):
-    checked = _by_joint(mechanism, values, what, lambda joint: joint.num_coordinates)
+    checked = by_joint(mechanism, values, what, lambda joint: joint.num_coordinates)
     for name, entry in checked.items():
         if mechanism.joint(name).has_quaternion and known(entry) is not None and not np.any(known(entry)[:4]):
             raise ValueError(f"{what} of joint {name!r} has a quaternion of zeros; no rotation is (1, 0, 0, 0)")
     return checked
 
 
-def _by_joint(mechanism, values, what, count):
+def by_joint(mechanism: Mechanism, values, what: str, count):
+    """Numbers of joints, checked: {name: array}, `count` of them for each joint."""
     checked = {}
     for name, entry in (values or {}).items():
         expected = count(mechanism.joint(name))

@@ -16,7 +16,7 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number
-from linkax.simulation.accuracy import Accuracy
+from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
@@ -87,9 +87,29 @@ class Solution(eqx.Module):
     end: State
     stats: dict[str, Any]
     result: RESULTS
-    rank_nearby: Int[Array, "*batch k"]
+    rank_nearby: Int[Array, "*batch k"] | None
     closest: Float[Array, "*batch"]
     interpolation: Any
+
+    @staticmethod
+    def of_state(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = BALANCED) -> "Solution":
+        """A solution of one time, to read reactions, energies or accelerations at a `State` on the closed loops."""
+        t = jnp.asarray(t, state.q.dtype)
+        return Solution(
+            mechanism=mechanism,
+            accuracy=accuracy,
+            ts=t[None],
+            q=state.q[None],
+            v=state.v[None],
+            ys=None,
+            t_end=t,
+            end=state,
+            stats={},
+            result=RESULTS.successful,
+            rank_nearby=None,
+            closest=jnp.ones((), state.q.dtype),
+            interpolation=None,
+        )
 
     def position(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
         """Position of a body's centre of mass, or of the point `at` on it [m].

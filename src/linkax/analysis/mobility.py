@@ -1,0 +1,96 @@
+"""How a mechanism can move at a state, and which of its constraints are redundant."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from linkax.equations.kinematics import configure
+from linkax.equations.loops import jacobian
+from linkax.equations.system import system_of
+from linkax.formulations.branches import Crossing
+from linkax.linalg.constrained_solve import least_multipliers
+from linkax.model.mechanism import Mechanism
+from linkax.model.topology import Topology
+from linkax.simulation.accuracy import BALANCED, Accuracy
+from linkax.simulation.state import State
+
+INVOLVED = 1e-6  # least part of a row in a self-stress of magnitude one
+# Table 1 of the paper: which axes of parent and child each rotation row keeps orthogonal.
+ROTATIONS = {(1, 2): "α₁", (2, 1): "α₁", (0, 2): "α₂", (0, 1): "α₃"}
+TRANSLATIONS = ("s₁", "s₂", "s₃")
+
+
+class Mobility(eqx.Module):
+    """How a mechanism can move at a state.
+
+    - `rank`: number of independent constraints. `degrees_of_freedom`: of the speeds there; one more
+      for each constraint that is lost in a singular configuration.
+    - `num_redundant`: constraints that depend on others, those that no motion changes included.
+    - `distance`: from the nearest singular configuration, see `linkax.Accuracy`; 0 in one only where
+      it is approached along a motion: here that configuration has a smaller `rank`.
+    - `dispensable`: of each constraint row, in the order of `rows`, whether it could be left out
+      without freeing anything.
+    """
+
+    rank: Int[Array, ""]
+    degrees_of_freedom: Int[Array, ""]
+    num_redundant: Int[Array, ""]
+    distance: Float[Array, ""]
+    dispensable: Bool[Array, " m"]
+    topology: Topology = eqx.field(static=True)
+
+    @property
+    def rows(self) -> tuple[tuple[str, str], ...]:
+        """(joint or constraint, row of Table 1 of the paper) of every row."""
+        topology = self.topology
+        cuts = topology.joints[topology.num_bodies :]
+        rotation = lambda rows: [(cuts[cut], ROTATIONS[i, j]) for cut, i, j in rows]
+        translation = lambda rows: [(cuts[cut], TRANSLATIONS[i]) for cut, i in rows]
+        return (
+            *rotation(topology.rotation_rows),
+            *translation(topology.translation_rows),
+            *((cuts[cut], "combined") for cut in topology.combining),
+            *((name, "coordinates") for name in topology.constraints),
+            *rotation(topology.immobile_rotation_rows),
+            *translation(topology.immobile_translation_rows),
+        )
+
+    @property
+    def redundant(self) -> dict[str, tuple[str, ...]]:
+        """Rows of each cut joint and constraint that could be left out, one at a time."""
+        found = {}
+        for (name, row), dispensable in zip(self.rows, np.asarray(self.dispensable), strict=True):
+            if dispensable:
+                found[name] = (*found.get(name, ()), row)
+        return found
+
+
+def mobility(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = BALANCED) -> Mobility:
+    """Rank, degrees of freedom and redundant constraints of a mechanism at a state on its closed loops.
+
+    **Arguments:** `t`: time [s]; `accuracy`: whose rank tolerance decides.
+    """
+    return _mobility(mechanism, state, jnp.asarray(t, float), accuracy)
+
+
+@eqx.filter_jit
+def _mobility(mechanism, state, t, accuracy):
+    system, topology = system_of(mechanism, state.q.dtype), mechanism.topology
+    tolerance = accuracy.method(system.dtype).rank_tolerance
+    inverse = Crossing.at(system, t, state.q, tolerance).inverse
+    rank = jnp.sum(inverse.rank)
+    rows = jacobian(configure(system, t, state.q))
+    immobile = len(topology.immobile_rotation_rows) + len(topology.immobile_translation_rows)
+    dispensable = jnp.zeros(0, bool)
+    if topology.num_rows:
+        free = least_multipliers(rows, rows[:, 0], system.units, tolerance, rank).free
+        dispensable = jnp.max(jnp.abs(free), axis=1, initial=0.0) > INVOLVED
+    return Mobility(
+        rank=rank,
+        degrees_of_freedom=topology.num_speeds - rank,
+        num_redundant=topology.num_rows + immobile - rank,
+        distance=inverse.distance,
+        dispensable=jnp.concatenate([dispensable, jnp.ones(immobile, bool)]),
+        topology=topology,
+    )

@@ -1,0 +1,97 @@
+"""Mobility, inverse dynamics, equilibrium and vibration at a state."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from known_answers import start
+
+import linkax as lx
+
+
+def test_mobility_of_a_bricard_names_its_redundant_rows():
+    found = lx.mobility(*start("bricard"))
+    assert (found.rank, found.degrees_of_freedom, found.num_redundant) == (4, 1, 1)
+    # Any one of the five may be left out, but not two.
+    assert found.redundant == {"P4": ("α₂", "α₃", "s₁", "s₂", "s₃")}
+
+
+def test_mobility_in_and_beside_a_singular_configuration():
+    mechanism, state = start("spatial-four-link", "FL2")
+    found = lx.mobility(mechanism, state)
+    assert (found.rank, found.degrees_of_freedom, found.num_redundant) == (1, 2, 4)
+    beside = lx.mobility(mechanism, lx.State(state.q + 0.1 * np.array([1.0, 1.0, -1.0]), state.v))
+    assert (beside.rank, beside.degrees_of_freedom, beside.num_redundant) == (2, 1, 3)
+    assert 0.01 < beside.distance < 0.2
+    assert beside.redundant == {"C": ("α₂", "α₃", "s₁")}
+
+
+def hanging(length, damping):
+    rod = lx.rod("rod", length, 2.0)
+    hinge = lx.Revolute("hinge", lx.GROUND, rod.at("base"), "z")
+    return lx.Mechanism([rod], [hinge], [lx.Gravity([0.0, -9.81, 0.0]), lx.JointDamper("hinge", damping)])
+
+
+def test_a_pendulum_comes_to_rest_and_vibrates():
+    mechanism = hanging(0.8, 0.3)
+    rest = lx.equilibrium(mechanism, lx.assemble(mechanism, {"hinge": 0.3}))
+    np.testing.assert_allclose(rest.q, -np.pi / 2, atol=1e-12)
+    found = lx.linearise(mechanism, rest)
+    natural, rate = np.sqrt(1.5 * 9.81 / 0.8), 0.3 / (2.0 * 0.8**2 / 3.0)
+    np.testing.assert_allclose(found.natural_frequencies, [natural], rtol=1e-12)
+    np.testing.assert_allclose(found.damping, [[rate]], rtol=1e-12)
+    damped = np.sqrt(natural**2 - rate**2 / 4.0)
+    np.testing.assert_allclose(sorted(found.eigenvalues.imag), [-damped, damped], rtol=1e-10)
+    # Upright it is at rest too, and falls at that rate.
+    upright = lx.equilibrium(mechanism, lx.State(jnp.array([np.pi / 2]), jnp.zeros(1)))
+    np.testing.assert_allclose(lx.linearise(mechanism, upright).natural_frequencies, [-natural], rtol=1e-12)
+
+
+def test_frequency_on_the_tangent_space_of_a_redundant_loop():
+    """The parallelogram hangs down and swings with a'' = -1.2 g cos a."""
+    mechanism, state = start("spatial-four-link", "FL3", {"angle": -1.2, "speed": 0.0})
+    rest = lx.equilibrium(mechanism, state)
+    np.testing.assert_allclose(rest.q[0], -np.pi / 2, atol=1e-10)
+    found = lx.linearise(mechanism, rest)
+    np.testing.assert_allclose(found.natural_frequencies, [np.sqrt(1.2 * 9.81)], rtol=1e-10)
+    mode = found.modes[:, 0] / found.modes[0, 0]
+    np.testing.assert_allclose(np.abs(mode), 1.0, rtol=1e-10)
+
+
+def test_derivative_of_an_equilibrium_and_of_a_frequency():
+    def stretched(stiffness):
+        body = lx.point_mass("body", 2.0)
+        slide = lx.Prismatic("slide", lx.GROUND, body, "y")
+        forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointSpring("slide", stiffness, 0.5)]
+        mechanism = lx.Mechanism([body], [slide], forces)
+        rest = lx.equilibrium(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)))
+        return rest.q[0], lx.linearise(mechanism, rest, degrees_of_freedom=1).natural_frequencies[0]
+
+    place, frequency = stretched(30.0)
+    np.testing.assert_allclose(place, 0.5 - 2.0 * 9.81 / 30.0, rtol=1e-12)
+    np.testing.assert_allclose(frequency, np.sqrt(15.0), rtol=1e-12)
+    found = jax.jacfwd(stretched)(30.0)
+    np.testing.assert_allclose(found, [2.0 * 9.81 / 30.0**2, 0.5 / np.sqrt(15.0) / 2.0], rtol=1e-9)
+    np.testing.assert_allclose(jax.grad(lambda k: stretched(k)[0])(30.0), found[0], rtol=1e-9)
+
+
+def test_nothing_holds_a_falling_body():
+    body = lx.point_mass("body", 2.0)
+    mechanism = lx.Mechanism([body], [lx.Prismatic("slide", lx.GROUND, body, "y")], [lx.Gravity([0.0, -9.81, 0.0])])
+    with pytest.raises(lx.EquilibriumError, match=r"no equilibrium near this state.*add what holds"):
+        lx.equilibrium(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)))
+
+
+def test_inverse_dynamics_undoes_the_dynamics():
+    mechanism, state = start("crank-slider", "SC3", {"angle": 0.4})
+    found = lx.inverse_dynamics(mechanism, state, {"bearing": 3.0})
+    torque = lx.JointTorque("bearing", found.forces["bearing"][0])
+    driven = lx.Mechanism(mechanism.bodies, mechanism.joints, [*mechanism.forces, torque])
+    here = lx.Solution.of_state(driven, state)
+    slider = lx.Solution.of_state(mechanism, state).acceleration("slider")[0]
+    acceleration = here.acceleration("crank", at="tip")[0]
+    along = np.array([-np.sin(0.4), np.cos(0.4), 0.0])
+    np.testing.assert_allclose(acceleration @ along, 3.0, rtol=1e-11)
+    assert np.linalg.norm(here.acceleration("slider")[0] - slider) > 1.0
+    with pytest.raises(ValueError, match=r"acceleration asked of joint '(bearing|guide)' is missed by"):
+        lx.inverse_dynamics(mechanism, state, {"bearing": 3.0, "guide": 100.0})

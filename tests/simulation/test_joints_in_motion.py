@@ -1,0 +1,172 @@
+"""Joint types in motion: quaternions, redundancy, singular configurations, drives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from known_answers import n_four_bar, reference
+
+import linkax as lx
+
+
+def rhombus(*kinds, copies=1, speed=1.0, gravity=0.0):
+    """The spatial four-link with other joints; it turns uniformly, and passes a singular position each half turn."""
+    along = np.array([1.0, 0.0, 0.0])
+    crank, coupler, rocker = (
+        lx.RigidBody(name, 1.0, along / 2, [0.01, 1 / 12, 1 / 12], {"base": 0.0 * along, "tip": along})
+        for name in ("crank", "coupler", "rocker")
+    )
+    ends = [
+        (lx.GROUND, crank.at("base")),
+        (crank.at("tip"), coupler.at("base")),
+        (coupler.at("tip"), rocker.at("tip")),
+        (lx.GROUND.at([1.0, 0.0, 0.0]), rocker.at("base")),
+    ]
+    joints = []
+    for name, kind, pair in zip("ABCD", kinds, ends, strict=True):
+        options = {} if kind is lx.Spherical else {"axis": "z"}
+        options |= {"pitch": 0.2} if kind is lx.Screw else {}
+        options |= {"second_axis": "y"} if kind is lx.Universal else {}
+        options |= {"cut": True} if name == "C" else {}
+        names = [name] + [f"{name}{copy}" for copy in range(1, copies) if name == "C"]
+        joints += [kind(each, *pair, **options) for each in names]
+    mechanism = lx.Mechanism([crank, coupler, rocker], joints, [lx.Gravity([0.0, -gravity, 0.0])])
+    turning = lambda turn: {"A": turn, "B": -turn, "D": turn}
+    of_kind = lambda turns: {
+        name: [turn] + [0.0] * (len(mechanism.joint(name).speed_units) - 1) for name, turn in turns.items()
+    }
+    return mechanism, lx.assemble(mechanism, of_kind(turning(np.pi / 2)), of_kind(turning(speed)))
+
+
+LOOPS = {
+    "universal and spherical": (lx.Revolute, lx.Universal, lx.Spherical, lx.Revolute),
+    "cylindrical": (lx.Revolute, lx.Cylindrical, lx.Cylindrical, lx.Cylindrical),
+    "screw": (lx.Screw, lx.Screw, lx.Screw, lx.Screw),
+}
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_every_joint_type_passes_singular_configurations(name):
+    mechanism, state = rhombus(*LOOPS[name])
+    found = lx.simulate(mechanism, state, t1=10.0, accuracy=lx.PRECISE)
+    turn = np.pi / 2 + found.ts
+    place = found.position("coupler", at="tip")[:, :2]
+    exact = np.stack([1.0 + np.cos(turn), np.sin(turn)], axis=-1)
+    assert np.max(np.abs(place - exact)) <= 1e-9
+    assert max(found.worst_violation()) <= 1e-11
+    assert len(found.passages().times) == 3
+
+
+def test_ten_cut_joints_move_like_one():
+    kinds = (lx.Revolute,) * 4
+    mechanism, state = rhombus(*kinds, copies=10, speed=-1.0, gravity=9.81)
+    assert mechanism.topology.num_rows == 20
+    found = lx.simulate(mechanism, state, t1=5.0, accuracy=lx.PRECISE)
+    place = found.position("coupler", at="tip")[:, :2] - np.array([1.0, 0.0])
+    np.testing.assert_allclose(place, n_four_bar(found.ts, 1), atol=1e-10)
+    # Of minimum norm: each carries a tenth of what one would.
+    angle, speed = found.joint("A"), found.joint_speed("A")
+    along, across = (jnp.cos(angle), jnp.sin(angle)), (-jnp.sin(angle), jnp.cos(angle))
+    inward, weight = (9.81 * jnp.sin(angle) - speed**2) / 2.0, -0.981 * jnp.cos(angle)
+    single = jnp.stack([inward * e + weight * n for e, n in zip(along, across, strict=True)], axis=-1)
+    away = np.abs(np.sin(angle)) > 0.01
+    np.testing.assert_allclose(-10.0 * found.reaction("C7").force[away, :2], single[away], atol=1e-6)
+    assert not np.any(found.reaction_unique("C7").force)
+
+
+def test_free_rigid_body_keeps_energy_and_angular_momentum_over_a_hundred_turns():
+    moments = np.array([1.0, 2.0, 2.5])
+    body = lx.RigidBody("body", 2.0, [0.1, 0.2, -0.1], moments)
+    mechanism = lx.Mechanism([body], [lx.Free("afloat", lx.GROUND, body)])
+    state = lx.assemble(mechanism, speeds={"afloat": [1.0, 0.2, 0.3, 0.1, 0.0, 0.0]})
+    found = lx.simulate(mechanism, state, t1=200.0 * np.pi, accuracy=lx.Accuracy(rtol=1e-13))
+    turn, omega = found.orientation("body"), found.angular_velocity("body")
+    spin = jnp.einsum("tij,j,tkj,tk->ti", turn, moments, turn, omega)
+    spin += 2.0 * jnp.cross(found.position("body"), found.velocity("body"))
+    assert np.ptp(found.energy()) <= 1e-9 * found.energy()[0]
+    assert np.max(np.linalg.norm(spin - spin[0], axis=-1)) <= 1e-9 * np.linalg.norm(spin[0])
+    np.testing.assert_allclose(np.linalg.norm(found.q[:, :4], axis=-1), 1.0, rtol=1e-15)
+
+
+def test_a_massless_rod_makes_a_pendulum_of_a_free_body():
+    body = lx.RigidBody("bob", 1.0, inertia=[1e-3, 1e-3, 1e-3])
+    rod = lx.Distance("rod", lx.GROUND, body, 1.0)
+    mechanism = lx.Mechanism([body], [lx.Free("free", lx.GROUND, body)], [lx.Gravity([0.0, -9.81, 0.0])], [rod])
+    state = lx.assemble(mechanism, guess={"free": [1.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0]})
+    found = lx.simulate(mechanism, state, t1=10.0, accuracy=lx.PRECISE)
+    known = reference("A01_pendulum")
+    bob = found.position("bob")
+    np.testing.assert_allclose(bob[::10, 0], known["x"][:21], atol=1e-9)
+    force, moment = found.reaction("rod")
+    tension = found.velocity("bob") ** 2 @ np.ones(3) - 9.81 * bob[:, 1]
+    np.testing.assert_allclose(force, -tension[:, None] * bob, atol=1e-8)
+    np.testing.assert_allclose(moment, 0.0, atol=1e-12)
+
+
+def swinging(amplitude, t):
+    return 0.3 + amplitude * jnp.sin(2.0 * t)
+
+
+def driven(crank, amplitude):
+    """A crank-slider whose crank is driven: it has no freedom left."""
+    arm, rod = lx.rod("crank", crank, 1.0), lx.rod("rod", 1.0, 1.0)
+    slider = lx.point_mass("slider", 1.0)
+    joints = [
+        lx.Revolute("bearing", lx.GROUND, arm.at("base"), "z"),
+        lx.Revolute("crank_pin", arm.at("tip"), rod.at("base"), "z"),
+        lx.Revolute("wrist_pin", rod.at("tip"), slider, "z"),
+        lx.Prismatic("guide", lx.GROUND, slider, "x"),
+    ]
+    motor = lx.Drive("motor", "bearing", jax.tree_util.Partial(swinging, amplitude))
+    mechanism = lx.Mechanism([arm, rod, slider], joints, [lx.Gravity([0.0, -9.81, 0.0])], [motor])
+    return mechanism, lx.assemble(mechanism, guess={"crank_pin": -0.6, "guide": 1.4})
+
+
+def test_a_drive_moves_its_joint_and_its_torque_does_the_work():
+    mechanism, state = driven(0.5, 1.0)
+    found = lx.simulate(mechanism, state, t1=3.0, accuracy=lx.PRECISE)
+    angle = swinging(1.0, found.ts)
+    np.testing.assert_allclose(found.joint("bearing"), angle, atol=1e-14)
+    slider = 0.5 * np.cos(angle) + np.sqrt(1.0 - (0.5 * np.sin(angle)) ** 2)
+    np.testing.assert_allclose(found.position("slider")[:, 0], slider, atol=1e-13)
+    assert max(found.worst_violation()) <= 1e-12
+    power = found.reaction("motor") * found.joint_speed("bearing")
+    work = np.cumsum((power[1:] + power[:-1]) / 2.0 * np.diff(found.ts))
+    gained = found.energy()[1:] - found.energy()[0]
+    np.testing.assert_allclose(work, gained, atol=2e-3 * np.max(gained))
+    assert np.all(found.reaction_unique("motor"))
+
+
+def test_a_drive_that_asks_for_the_impossible_is_named_with_its_time():
+    mechanism, state = driven(1.2, 1.0)
+    # The crank cannot turn further than the rod reaches: 1.2 sin(angle) = 1.
+    latest = np.arcsin((np.arcsin(1.0 / 1.2) - 0.3) / 1.0) / 2.0
+    with pytest.raises(lx.SimulationError, match=r"drive 'motor' of joint 'bearing' asks for what the loops") as error:
+        lx.simulate(mechanism, state, t1=3.0)
+    np.testing.assert_allclose(error.value.solution.t_end, latest, rtol=1e-4)
+    np.testing.assert_allclose(float(str(error.value).split("t = ")[1].split(" s")[0]), latest, rtol=1e-4)
+
+
+def test_a_force_that_is_not_finite_is_named():
+    link = lx.rod("link", 1.0, 1.0)
+    hinge = lx.Revolute("hinge", lx.GROUND, link.at("base"), "z")
+    torque = lx.JointTorque("hinge", lambda t, motion: jnp.sqrt(0.5 - t))
+    mechanism = lx.Mechanism([link], [hinge], [torque])
+    with pytest.raises(lx.SimulationError, match=r"at t = 0\.5 s.*load of JointTorque on 'hinge' is not finite"):
+        lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0)
+
+
+def test_a_force_of_the_wrong_shape_is_named():
+    link = lx.rod("link", 1.0, 1.0)
+    hinge = lx.Revolute("hinge", lx.GROUND, link.at("base"), "z")
+    mechanism = lx.Mechanism([link], [hinge], [lx.JointTorque("hinge", lambda t, motion: t * jnp.ones(2))])
+    with pytest.raises(ValueError, match=r"JointTorque on 'hinge'.*shape \(2,\).*single number"):
+        lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0)
+
+
+def test_bodies_that_move_without_mass_are_named():
+    bead, rod = lx.point_mass("bead", 1.0), lx.rod("rod", 1.0, 1.0)
+    joints = [lx.Planar("table", lx.GROUND, bead, "z"), lx.Revolute("hinge", lx.GROUND, rod.at("base"), "z")]
+    mechanism = lx.Mechanism([bead, rod], joints)
+    with pytest.raises(lx.SimulationError, match=r"before it began: Bodies without mass.*They are 'bead'\.$"):
+        lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0)
