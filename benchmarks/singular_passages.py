@@ -9,8 +9,6 @@ Each table is of this machine, this run; times are ratios. `--part` chooses one 
 - `long`: 10 000 s of the four-bar, about one passage a second.
 """
 
-import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -24,6 +22,7 @@ import linkax as lx
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from known_answers import PASSING, start
+from parts import print_parts
 
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12, 1e-13)
 STEPS = (10e-3, 5e-3, 2e-3, 1e-3, 0.5e-3)
@@ -126,23 +125,5 @@ def long():
 PARTS = {part.__name__: part for part in (tolerances, steps, phases, cost, long)}
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", choices=PARTS, action="append", help="default: all")
-    parser.add_argument("--json", action="store_true")
-    arguments = parser.parse_args()
-    found = {}
-    for name in arguments.part or PARTS:
-        found[name] = []
-        if not arguments.json:
-            print(f"\n{name}")
-        for row in PARTS[name]():
-            found[name].append(row)
-            if not arguments.json:
-                print("  " + "  ".join(f"{key} {entry}" for key, entry in row.items()), flush=True)
-    if arguments.json:
-        print(json.dumps(found))
-
-
 if __name__ == "__main__":
-    main()
+    print_parts(__doc__, PARTS)

@@ -17,7 +17,7 @@ from linkax.analysis.vibration import EquilibriumError as EquilibriumError  # no
 from linkax.analysis.vibration import Linearisation as Linearisation  # noqa: E402
 from linkax.analysis.vibration import equilibrium as equilibrium  # noqa: E402
 from linkax.analysis.vibration import linearise as linearise  # noqa: E402
-from linkax.equations.kinematics import Motion as Motion  # noqa: E402
+from linkax.equations.motion import Motion as Motion  # noqa: E402
 from linkax.equations.reactions import Reaction as Reaction  # noqa: E402
 from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402
 from linkax.linalg.pivoted_qr import pivoted_qr as pivoted_qr  # noqa: E402
@@ -58,9 +58,9 @@ from linkax.simulation.accuracy import PRECISE as PRECISE  # noqa: E402
 from linkax.simulation.accuracy import Accuracy as Accuracy  # noqa: E402
 from linkax.simulation.assembly import AssemblyError as AssemblyError  # noqa: E402
 from linkax.simulation.assembly import assemble as assemble  # noqa: E402
+from linkax.simulation.instant import Violation as Violation  # noqa: E402
 from linkax.simulation.results import RESULTS as RESULTS  # noqa: E402
 from linkax.simulation.results import SimulationError as SimulationError  # noqa: E402
 from linkax.simulation.simulate import simulate as simulate  # noqa: E402
 from linkax.simulation.solution import Solution as Solution  # noqa: E402
-from linkax.simulation.solution import Violation as Violation  # noqa: E402
 from linkax.simulation.state import State as State  # noqa: E402

@@ -16,8 +16,10 @@ from known_answers import start
 from mechanisms import POOL, crank_slider, with_cut
 
 import linkax as lx
-from linkax.equations import dynamics, kinematics, loops
+from linkax.equations import dynamics, loops
+from linkax.equations.configuration import bodies_of_cuts, configure
 from linkax.equations.coordinates import neutral, on_manifold, rates, retract
+from linkax.equations.motion import move
 from linkax.equations.reactions import cut_reactions, reactions
 from linkax.equations.system import system_of
 from linkax.spatial.rotations import cross
@@ -34,7 +36,7 @@ def state_of(mechanism, seed=0):
 
 
 def poses(system, t, q):
-    configuration = kinematics.configure(system, t, on_manifold(system.topology, q))
+    configuration = configure(system, t, on_manifold(system.topology, q))
     return configuration.world_center_of_mass(), configuration.rotation[:-1]
 
 
@@ -69,8 +71,8 @@ def momentum(system, t, q, v):
 def laws(mechanism, t, q, v, acceleration, multipliers):
     """Pairs of what the equations say, and what differentiation and laws say."""
     system, topology = system_of(mechanism, float), mechanism.topology
-    configuration = kinematics.configure(system, t, q)
-    motion = kinematics.move(configuration, v)
+    configuration = configure(system, t, q)
+    motion = move(configuration, v)
     mass, force = dynamics.mass_matrix(configuration), dynamics.generalised_force(motion)
     load = dynamics.applied_load(motion)
     applied = load.joint_force + dynamics.along_speeds(configuration, load.force, load.moment)
@@ -88,12 +90,12 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     of_inertia = jnp.einsum("bin,bij,bjm->nm", by_speed[1], tensor, by_speed[1])
 
     # Loop rows: ċ = J v − b and c̈ = J v̇ − γ.
-    rows = lambda t, q, v: loops.residual(kinematics.configure(system, t, q))
+    rows = lambda t, q, v: loops.residual(configure(system, t, q))
     rate = lambda t, q, v: jax.jvp(lambda t, q: rows(t, q, v), (t, q), (jnp.ones(()), rates(topology, q, v)))[1]
 
     # Reactions, for any accelerations and multipliers.
     every, cut = reactions(motion, acceleration, multipliers), cut_reactions(configuration, multipliers)
-    parent, child, joints = kinematics.bodies_of_cuts(topology)
+    parent, child, joints = bodies_of_cuts(topology)
     velocity = lambda body, arm: motion.velocity[body] + cross(motion.angular_velocity[body], arm)
     on_parent = velocity(parent, configuration.parent_arm[joints] + configuration.separation)
     power = jnp.sum(cut.force * (velocity(child, configuration.child_arm[joints]) - on_parent))
@@ -105,7 +107,7 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     left = jnp.sum(sign * (every.force[body] * configuration.sliding + every.moment[body] * configuration.angular), -1)
     solved = jnp.linalg.solve(mass, force + jacobian.T @ multipliers)
     energy = along(lambda t, q, v: kinetic_energy(system, t, q, v), solved)
-    stored = along(lambda t, q, v: dynamics.potential_energy(kinematics.configure(system, t, q)), solved)
+    stored = along(lambda t, q, v: dynamics.potential_energy(configure(system, t, q)), solved)
     storing = [force for force in system.forces if isinstance(force, (lx.Gravity, lx.Spring, lx.JointSpring))]
     loads = reduce(lx.Load.plus, [force.load(t, motion) for force in storing], lx.Load.none(system))
     released = loads.joint_force + dynamics.along_speeds(configuration, loads.force, loads.moment)
@@ -155,7 +157,7 @@ def test_rows_that_were_left_out_never_change():
         assert mechanism.topology.num_rows == 2
         system = system_of(mechanism, float)
         q = state_of(mechanism)[0]
-        immobile = lambda q, system=system: loops.immobile_residual(kinematics.configure(system, 0.0, q))
+        immobile = lambda q, system=system: loops.immobile_residual(configure(system, 0.0, q))
         np.testing.assert_allclose(jax.jacfwd(immobile)(q), 0.0, atol=1e-15)
         np.testing.assert_allclose(immobile(q), 0.0, atol=1e-15)
 
@@ -170,7 +172,7 @@ def test_far_from_the_origin_nothing_is_lost():
 def test_reactions_do_not_depend_on_the_tree():
     """A spatial loop with a redundant row at one state, each joint cut in turn: what is unique is the same."""
     mechanism, state = start("bricard", changes={"angle": 0.9, "speed": 2.0})
-    coordinates = kinematics.configure(system_of(mechanism, float), 0.0, state.q).joint_coordinates
+    coordinates = configure(system_of(mechanism, float), 0.0, state.q).joint_coordinates
     joints = {name: coordinates(name)[0] for name in mechanism.topology.joints}
     found = {}
     for cut in ("P1", "P4"):

@@ -121,6 +121,12 @@ def test_a_ball_is_held_where_it_is_asked_and_turns_as_asked():
     state = lx.assemble(mechanism, {"ball": turned}, {"ball": [0.1, 0.2, 0.3]})
     np.testing.assert_allclose(state.q, turned / np.linalg.norm(turned), atol=1e-14)
     np.testing.assert_allclose(state.v, [0.1, 0.2, 0.3], atol=1e-14)
+    state = lx.assemble(mechanism, speeds={("ball", 2): 0.5})
+    np.testing.assert_allclose(state.v, [0.0, 0.0, 0.5], atol=1e-14)
+    with pytest.raises(ValueError, match=r"position of joint 'ball': index 1 is part of a quaternion"):
+        lx.assemble(mechanism, {("ball", 1): 0.1})
+    with pytest.raises(ValueError, match=r"speed of joint 'ball': index 3; it has 3 speeds"):
+        lx.assemble(mechanism, speeds={("ball", 3): 0.1})
     with pytest.raises(ValueError, match=r"position of joint 'ball' has a quaternion of zeros"):
         lx.assemble(mechanism, {"ball": np.zeros(4)})
     with pytest.raises(ValueError, match=r"position of joint 'ball' is one number; the joint has 4"):

@@ -32,14 +32,6 @@ def test_passages_are_told(variant):
     assert np.median(found.singularity_distance()) > 0.1
 
 
-def test_a_start_in_a_singular_configuration_is_at_distance_zero():
-    mechanism, state = start("n-four-bar", "A02", {"N": 1, "gravity": 0.0, "speed": 1.0, "angle": 0.0})
-    found = lx.simulate(mechanism, state, t1=10.0)
-    assert found.rank_nearby == [2]
-    assert found.rank()[0] == 1
-    assert found.singularity_distance()[0] <= 1e-15
-
-
 def test_a_motion_without_passages_tells_none():
     mechanism, state = start("crank-slider", "regular")
     found = lx.simulate(mechanism, state, t1=2.0)

@@ -18,11 +18,10 @@ GROWTH = {"crank-slider": 400.0, "n-four-bar": 2000.0}
 PASSAGE = 2.5e-13
 
 
+# All of Dopri8; benchmarks/singular_passages.py has the others in full.
 MATRIX = [(diffrax.Dopri8(), name) for name in PASSING]
-MATRIX += [
-    (solver, name) for solver in (diffrax.Dopri5(), diffrax.Tsit5()) for name in PASSING if name[:2] in ("SC", "FL")
-]
-MATRIX += [(solver, "A02-1") for solver in (diffrax.Dopri5(), diffrax.Tsit5())]
+MATRIX += [(diffrax.Dopri5(), name) for name in PASSING if name.startswith("SC")]
+MATRIX += [(diffrax.Tsit5(), name) for name in ("FL1", "FL2", "A02-1")]
 
 
 @pytest.mark.parametrize(("solver", "name"), MATRIX, ids=[f"{type(s).__name__}-{name}" for s, name in MATRIX])
@@ -41,7 +40,7 @@ def test_tighter_tolerances_are_never_worse(solver, name):
         assert steps[3] <= 3 * steps[2]
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 10])
+@pytest.mark.parametrize("count", [1, 2, 5])
 def test_row_of_four_bars_stays_on_its_branch(count):
     found = lx.simulate(*start("n-four-bar", "A02", {"N": count}), t1=10.0, accuracy=lx.PRECISE)
     error = found.position("link_0", at="tip")[-1, :2] - n_four_bar(10.0, count)
@@ -67,8 +66,7 @@ class RK4(diffrax.AbstractERK):
         return 4
 
 
-@pytest.mark.parametrize("solver", [RK4(), diffrax.Dopri8()], ids=["RK4", "Dopri8"])
-@pytest.mark.parametrize("name", ["SC2", "FL1"])
+@pytest.mark.parametrize(("solver", "name"), [(RK4(), "SC2"), (diffrax.Dopri8(), "FL1")], ids=["RK4", "Dopri8"])
 def test_smaller_fixed_steps_are_never_worse(solver, name):
     run = PASSING[name]._replace(t1=5.0)
     errors = []

@@ -49,7 +49,7 @@ class FreeCrankSlider:
         return np.array([find(angle, elapsed) for angle, elapsed in ends])
 
 
-MEMBERS = 1000
+MEMBERS = 400
 
 
 def next_to_the_singular_configuration():

@@ -8,25 +8,30 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from linkax.equations.configuration import configure
 from linkax.equations.coordinates import rates
 from linkax.equations.dynamics import generalised_force, mass_matrix
-from linkax.equations.kinematics import configure, move
 from linkax.equations.loops import gamma, jacobian
+from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.linalg.constrained_solve import constrained_solve, invert, least_multipliers
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.accuracy import BALANCED
-from linkax.simulation.assembly import by_joint
+from linkax.simulation.given import by_joint
 from linkax.simulation.state import State
 
 MET = 1e-9  # relative to the largest acceleration
 
 
 class InverseDynamics(NamedTuple):
-    """- `forces`: {joint: along its speeds [N m or N], on the child}. `acceleration`: v̇ of the tree, (n_v,)."""
+    """What drives a prescribed motion.
 
-    forces: dict[str, Float[Array, " n"]]
+    - `forces`: {joint, as it was given: along its speeds [N m or N], on the child, (n,)}.
+    - `acceleration`: v̇ of the tree's joints, (n_v,).
+    """
+
+    forces: dict
     acceleration: Float[Array, " n_v"]
 
 
@@ -36,21 +41,25 @@ def inverse_dynamics(mechanism: Mechanism, state: State, accelerations, *, t=0.0
     What is not prescribed moves as the forces drive it. The mechanism's own forces act besides.
     Where several sets of forces do the same, these have the smallest norm.
 
-    **Arguments:** `accelerations`: {joint, in the tree or cut: rates of its speeds [rad/s² or m/s²]}.
+    **Arguments:** `accelerations`: {joint, in the tree or cut: rates of its speeds [rad/s² or m/s²]};
+    (joint, index) for one of several.
 
     **Raises:** `ValueError` where the loops do not allow the accelerations together, naming the joint.
     """
+    if not accelerations:
+        raise ValueError("inverse_dynamics needs accelerations; give {joint: acceleration, ...}")
     wanted = by_joint(mechanism, accelerations, "acceleration", lambda joint: len(joint.speed_units))
-    found, misses = _inverse_dynamics(mechanism, state, wanted, jnp.asarray(t, float))
-    if known(found.acceleration) is not None:
-        scale = max(1.0, *(float(np.max(np.abs(entry), initial=0.0)) for entry in wanted.values()))
-        for name, miss in misses.items():
+    acceleration, forces, misses = _inverse_dynamics(mechanism, state, wanted, jnp.asarray(t, float))
+    if known(acceleration) is not None:
+        scale = max(1.0, *(float(np.max(np.abs(entry), initial=0.0)) for entry in wanted.values))
+        for along, miss in zip(wanted.terms, misses, strict=True):
             if not np.max(np.abs(miss), initial=0.0) <= MET * scale:
+                size = np.max(np.abs(miss))
                 raise ValueError(
-                    f"the acceleration asked of joint {name!r} is missed by {np.max(np.abs(miss)):.6g}; the loops do "
-                    "not allow it together with the others, so ask for fewer"
+                    f"the acceleration asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not allow "
+                    "it together with the others, so ask for fewer"
                 )
-    return found
+    return InverseDynamics(dict(zip(accelerations, forces, strict=True)), acceleration)
 
 
 @eqx.filter_jit
@@ -60,18 +69,16 @@ def _inverse_dynamics(mechanism, state, wanted, t):
     motion, mass, loops = move(configuration, v), mass_matrix(configuration), jacobian(configuration)
 
     def speeds(q, v):
-        motion = move(configure(system, t, q), v)
-        return jnp.concatenate([motion.joint_speeds(name) for name in wanted])
+        return jnp.concatenate(wanted.speeds(move(configure(system, t, q), v)))
 
     turning = jax.jvp(lambda q: speeds(q, v), (q,), (rates(system.topology, q, v),))[1]
     along = jax.jacfwd(lambda v: speeds(q, v))(v)
     rows = jnp.concatenate([loops, along])
-    right = jnp.concatenate([gamma(motion), jnp.concatenate([*wanted.values()]) - turning])
+    right = jnp.concatenate([gamma(motion), jnp.concatenate(wanted.values) - turning])
     tolerance = BALANCED.method(system.dtype).rank_tolerance
     inverse = invert(mass, rows, system.units, tolerance)
     acceleration, multipliers = constrained_solve(inverse, mass, rows, generalised_force(motion), right)
     multipliers = least_multipliers(rows, multipliers, system.units, tolerance, inverse.rank).multipliers
-    ends = np.cumsum([len(entry) for entry in wanted.values()])[:-1]
-    split = lambda entries: dict(zip(wanted, jnp.split(entries, ends), strict=True))
+    ends = np.cumsum([len(entry) for entry in wanted.values])[:-1]
     misses = rows @ acceleration - right
-    return InverseDynamics(split(multipliers[len(loops) :]), acceleration), split(misses[len(loops) :])
+    return acceleration, jnp.split(multipliers[len(loops) :], ends), jnp.split(misses[len(loops) :], ends)

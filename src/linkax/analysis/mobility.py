@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from linkax.equations.kinematics import configure
+from linkax.equations.configuration import configure
 from linkax.equations.loops import jacobian
 from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.kinematics import Configuration, Motion, by_body, over_subtree
+from linkax.equations.configuration import Configuration, by_body, over_subtree
+from linkax.equations.motion import Motion
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, cross, dot, rotate, transpose
 

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from linkax.equations.configuration import Configuration, bodies_of_cuts
 from linkax.equations.coordinates import by_speed
-from linkax.equations.kinematics import Configuration, Motion, bodies_of_cuts
+from linkax.equations.motion import Motion
 from linkax.equations.system import System
 from linkax.model.constraints import Drive
 from linkax.spatial.rotations import cross, dot, rotate, transpose

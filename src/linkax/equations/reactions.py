@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from linkax.equations.configuration import Configuration, bodies_of_cuts, by_body, over_subtree
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
-from linkax.equations.kinematics import Configuration, Motion, bodies_of_cuts, by_body, over_subtree
 from linkax.equations.loops import Rows, combined_rows, immobile_rows, plain_rows, sorted_multipliers
+from linkax.equations.motion import Motion
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, cross, rotate, transpose
 

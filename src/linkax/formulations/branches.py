@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from linkax.equations.kinematics import Configuration, configure, move
+from linkax.equations.configuration import Configuration, configure
 from linkax.equations.loops import bias, drive_acceleration, jacobian
+from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.linalg.constrained_solve import Inverse, invert_apart
 from linkax.linalg.pivoted_qr import pivoted_qr

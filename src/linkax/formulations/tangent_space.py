@@ -12,10 +12,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from linkax.equations.configuration import Configuration, configure
 from linkax.equations.coordinates import on_manifold, retract, speeds
 from linkax.equations.dynamics import generalised_force, mass_matrix
-from linkax.equations.kinematics import Configuration, configure, move
 from linkax.equations.loops import gamma, is_driven, jacobian, rate, residual
+from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.branches import Crossing
 from linkax.formulations.passage import Course, Value, limit

@@ -95,6 +95,14 @@ class Topology:
         """Where in v the speed of a term lies, of a joint in the tree."""
         return self.speeds[term.joint].start + (term.index or 0)
 
+    def places(self, term: Term) -> slice:
+        """Where in q the coordinates of a term lie, of a joint in the tree."""
+        taken = self.coordinates[term.joint]
+        if term.index is None:
+            return taken
+        place = taken.start + term.index + self.joint_types[self.joints.index(term.joint)].has_quaternion
+        return slice(place, place + 1)
+
     @cached_property
     def column_body(self) -> np.ndarray:
         """The body that each speed moves directly, shape (n_v,)."""
@@ -184,7 +192,7 @@ class Topology:
         return root
 
     def describe(self) -> str:
-        """The spanning tree and the cut joints, a line for each joint."""
+        """The spanning tree, the cut joints and the constraints on coordinates, a line for each."""
         lines = []
         for index, name in enumerate(self.joints):
             ends = [
@@ -193,6 +201,8 @@ class Topology:
             ]
             role = "tree" if index < self.num_bodies else "cut"
             lines.append(f"{role:4} {self.joint_types[index].__name__} {name!r}: {ends[0]} - {ends[1]}")
+        for name, terms in zip(self.constraints, self.constraint_terms, strict=True):
+            lines.append(f"row  {name!r}: {', '.join(repr(term.joint) for term in terms)}")
         return "\n".join(lines)
 
 

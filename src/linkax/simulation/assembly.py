@@ -6,15 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, on_manifold, retract
-from linkax.equations.kinematics import configure, move, wrapped
 from linkax.equations.loops import Gap, as_if_closed, flips, gaps, jacobian, rate, residual
+from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
 from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import constrained_solve, invert
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known, number
+from linkax.model.numbers import known
+from linkax.model.terms import Term
 from linkax.simulation.accuracy import BALANCED
+from linkax.simulation.given import Given, by_joint, coordinates_by_joint
 from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
@@ -39,10 +42,11 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
 
     **Arguments:**
 
-    - `positions`: {joint name: coordinates [rad or m]}, of joints in the tree or cut; held. A
-      number for a joint with one coordinate, else all of them; see the joint types.
-    - `speeds`: {joint name: speeds [rad/s or m/s]}, likewise; held.
-    - `guess`: {joint name: coordinates} of joints in the tree, where the search starts (default:
+    - `positions`: {joint: coordinates [rad or m]}, of joints in the tree or cut; held. A number for
+      a joint with one coordinate, else all of them; see the joint types. For one of several the
+      key is (joint, index), counted like the joint's speeds.
+    - `speeds`: {joint: speeds [rad/s or m/s]}, likewise; held.
+    - `guess`: {joint: coordinates} of joints in the tree, where the search starts (default:
       frames that coincide); chooses the assembly mode.
     - `t`: time [s], which matters to drives.
 
@@ -58,9 +62,11 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
     raised; `linkax.simulate` marks such a state in its result.
     """
-    positions, guess = _coordinates(mechanism, positions, "position"), _coordinates(mechanism, guess, "guess")
+    positions, guess = (
+        coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess"))
+    )
     speeds = by_joint(mechanism, speeds, "speed", lambda joint: len(joint.speed_units))
-    for name in guess:
+    for name, _ in guess.terms:
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
     state, remainder = _assemble(mechanism, positions, speeds, guess, jnp.asarray(t, float))
@@ -69,29 +75,9 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     return state
 
 
-def _coordinates(mechanism, values, what):
-    checked = by_joint(mechanism, values, what, lambda joint: joint.num_coordinates)
-    for name, entry in checked.items():
-        if mechanism.joint(name).has_quaternion and known(entry) is not None and not np.any(known(entry)[:4]):
-            raise ValueError(f"{what} of joint {name!r} has a quaternion of zeros; no rotation is (1, 0, 0, 0)")
-    return checked
-
-
-def by_joint(mechanism: Mechanism, values, what: str, count):
-    """Numbers of joints, checked: {name: array}, `count` of them for each joint."""
-    checked = {}
-    for name, entry in (values or {}).items():
-        expected = count(mechanism.joint(name))
-        scalar = np.ndim(entry) == 0
-        if scalar and expected != 1:
-            raise ValueError(f"{what} of joint {name!r} is one number; the joint has {expected} of them")
-        checked[name] = number([entry] if scalar else entry, (expected,), f"{what} of joint {name!r}")
-    return checked
-
-
 def _raise_if_open(mechanism, state, t, remainder):
     topology = mechanism.topology
-    held = ", ".join(map(repr, remainder.positions)) or "none"
+    held = ", ".join(repr(along.joint) for along in remainder.positions.terms) or "none"
     remains = lambda size, unit: f"a gap of {size:.6g} {unit} remains (positions held: {held})"
     advice = "check lengths and offsets, hold fewer positions, or give another guess"
     cuts = topology.joints[topology.num_bodies :]
@@ -107,10 +93,11 @@ def _raise_if_open(mechanism, state, t, remainder):
                 f"{remains(size, 'rad or m')}; {advice}"
             )
     for what, misses in (("position", remainder.positions), ("speed", remainder.speeds)):
-        for name, miss in misses.items():
+        for along, miss in zip(misses.terms, misses.values, strict=True):
             if not np.all(np.abs(miss) <= CLOSED * max(remainder.length, 1.0)):
+                size = np.max(np.abs(miss))
                 raise AssemblyError(
-                    f"the {what} asked of joint {name!r} is missed by {np.max(np.abs(miss)):.6g}; the loops do not "
+                    f"the {what} asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not "
                     f"allow it together with the other {what}s given, so ask for fewer"
                 )
     if not remainder.off_branch <= ON_BRANCH * BALANCED.method(state.q.dtype).rank_tolerance:
@@ -128,8 +115,8 @@ class _Remainder(eqx.Module):
 
     gap: Gap
     length: jax.Array
-    positions: dict[str, jax.Array]
-    speeds: dict[str, jax.Array]
+    positions: Given
+    speeds: Given
     off_branch: jax.Array
 
 
@@ -138,36 +125,37 @@ class _Demand(eqx.Module):
 
     system: System
     t: jax.Array
-    held: dict[str, jax.Array]
+    held: Given
 
     def misses(self, q):
-        """How far each held joint is from where it should be, one number for each of its speeds."""
-        topology, apart = self.system.topology, {}
+        """How far what is held is from where it should be, one number for each speed."""
+        topology, apart = self.system.topology, []
         configuration = configure(self.system, self.t, q)
-        for name, entry in self.held.items():
-            kind, found = topology.joint_types[topology.joints.index(name)], configuration.joint_coordinates(name)
-            turns = 4 * kind.has_quaternion
-            missed = found[turns:] - entry[turns:]
-            if name not in topology.coordinates:
-                angles = np.array([unit == "rad" for unit in kind.speed_units[3 * kind.has_quaternion :]], dtype=bool)
-                missed = wrapped(missed, angles)
-            if kind.has_quaternion:
-                turn = multiply(found[:4], conjugate(entry[:4] / jnp.linalg.norm(entry[:4])))
-                missed = jnp.concatenate([rotation_vector(turn), missed])
-            apart[name] = missed
-        return apart
+        for along, entry in zip(self.held.terms, self.held.values, strict=True):
+            kind = topology.joint_types[topology.joints.index(along.joint)]
+            turning = 3 * kind.has_quaternion
+            indices = range(turning, len(kind.speed_units)) if along.index is None else [along.index]
+            ends = entry[turning + kind.has_quaternion :] if along.index is None else entry
+            away = lambda index, end, name=along.joint: configuration.joint_displacement(Term(name, index), end)
+            missed = [away(index, end) for index, end in zip(indices, ends, strict=True)]
+            missed = [jnp.stack(missed)] if missed else []
+            if kind.has_quaternion and along.index is None:
+                found = configuration.joint_coordinates(along.joint)[:4]
+                missed.insert(0, rotation_vector(multiply(found, conjugate(entry[:4] / jnp.linalg.norm(entry[:4])))))
+            apart.append(jnp.concatenate([jnp.zeros(0, q.dtype), *missed]))
+        return tuple(apart)
 
     def rows(self, q):
         """All that must vanish: loop rows, axes that point apart, misses."""
         configuration = configure(self.system, self.t, q)
-        return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(q).values()])
+        return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(q)])
 
     def jacobian(self, q):
         """Derivative of the rows, where the loops are closed; elsewhere the direction that closes them."""
         configuration = as_if_closed(configure(self.system, self.t, q))
         still = jnp.zeros(self.system.topology.num_speeds, q.dtype)
         held = jax.jacfwd(lambda change: self.misses(retract(self.system.topology, q, change)))(still)
-        return jnp.concatenate([jacobian(configuration), flips(configuration)[1], *held.values()])
+        return jnp.concatenate([jacobian(configuration), flips(configuration)[1], *held])
 
     def least_change(self, q, right):
         """The smallest change that changes the rows by `right`, in radians and lengths of the mechanism."""
@@ -240,15 +228,12 @@ def _speeds(system, t, q, held):
     tolerance = BALANCED.method(q.dtype).rank_tolerance
     crossing = Crossing.at(system, t, q, tolerance)
 
-    def of_joints(v):
-        motion = move(crossing.configuration, v)
-        return {name: motion.joint_speeds(name) for name in held}
-
-    asked = jnp.concatenate([rate(system, t), *held.values()])
+    of_joints = lambda v: held.speeds(move(crossing.configuration, v))
+    asked = jnp.concatenate([rate(system, t), *held.values])
     largest = jnp.max(jnp.abs(asked), initial=0.0)
     scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
     still = jnp.zeros(system.topology.num_speeds, q.dtype)
-    rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(of_joints)(still).values()])
+    rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(of_joints)(still)])
     metric = jnp.diag(system.units**-2)
     # A little beside the smallest speeds, which may lie just between two branches.
     beside = BESIDE * crossing.inverse.basis @ jnp.ones_like(still)
@@ -268,8 +253,8 @@ def _speeds(system, t, q, held):
 
     v, turns = lax.scan(turn, still, jnp.arange(TURNS) == 0)
     missed = jnp.max(jnp.abs(asked / scale - rows @ v), initial=0.0)
-    reached = of_joints(scale * turns[0])
-    misses = {name: reached[name] - held[name] for name in held}
+    reached = zip(of_joints(scale * turns[0]), held.values, strict=True)
+    misses = Given(held.terms, tuple(found - entry for found, entry in reached))
     return scale * v, misses, jnp.maximum(off_branch(v), missed)
 
 
@@ -278,9 +263,10 @@ def _assemble(mechanism, positions, speeds, guess, t):
     system = system_of(mechanism, jnp.result_type(float))
     topology = system.topology
     q = neutral(topology, system.dtype)
-    for name, entry in {**guess, **positions}.items():
-        if name in topology.coordinates:
-            q = q.at[topology.coordinates[name]].set(entry)
+    for given in (guess, positions):
+        for along, entry in zip(given.terms, given.values, strict=True):
+            if along.joint in topology.coordinates:
+                q = q.at[topology.places(along)].set(entry)
     demand = _Demand(system, t, positions)
     q = lax.stop_gradient(lax.stop_gradient(demand).search(lax.stop_gradient(on_manifold(topology, q))))
     # Carries the derivative. Loops that do not close stay as open as they were found.
@@ -291,7 +277,7 @@ def _assemble(mechanism, positions, speeds, guess, t):
     remainder = _Remainder(
         gap=gaps(configure(system, t, q)),
         length=system.length,
-        positions=demand.misses(q),
+        positions=Given(positions.terms, demand.misses(q)),
         speeds=misses,
         off_branch=off_branch,
     )

@@ -5,9 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from linkax.equations.configuration import configure
 from linkax.equations.dynamics import mass_matrix
-from linkax.equations.kinematics import configure, move
 from linkax.equations.loops import gaps, jacobian, residual
+from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import invert

@@ -8,8 +8,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from linkax.equations.kinematics import configure, move
+from linkax.equations.configuration import configure
 from linkax.equations.loops import gaps
+from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.simulation.state import State

@@ -1,63 +1,22 @@
 """The motion that a simulation found, and what can be read from it."""
 
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
-from linkax.equations.kinematics import configure, move
-from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
-from linkax.equations.reactions import Axes, Reaction, Side, reactions, reactions_to, seen_from
-from linkax.equations.system import System, system_of
-from linkax.formulations.tangent_space import TangentSpace
-from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
+from linkax.equations.reactions import Axes, Reaction, Side
+from linkax.equations.system import system_of
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number
 from linkax.simulation.accuracy import BALANCED, Accuracy
+from linkax.simulation.instant import Instant, Violation
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
 from linkax.simulation.state import State
-from linkax.spatial.rotations import cross, rotate
-
-UNCHANGED = 1e-6  # by a self-stress of magnitude one
-
-
-class Violation(NamedTuple):
-    """Largest violation of the loop rows, at each time or over the run.
-
-    - `position`: c, rotation rows [rad], translation rows in lengths of the loop.
-    - `velocity`: J v [1/s]. `acceleration`: J v̇ − γ [1/s²].
-    """
-
-    position: Float[Array, "..."]
-    velocity: Float[Array, "..."]
-    acceleration: Float[Array, "..."]
-
-
-class _Instant(NamedTuple):
-    """One saved time of a solution."""
-
-    system: System
-    method: TangentSpace
-    t: Float[Array, ""]
-    q: Float[Array, " n_q"]
-    v: Float[Array, " n_v"]
-
-    @property
-    def configuration(self):
-        return configure(self.system, self.t, self.q)
-
-    @property
-    def motion(self):
-        return move(self.configuration, self.v)
-
-    @property
-    def dynamics(self):
-        return self.method.dynamics(self.system, self.t, self.q, self.v)
 
 
 class Solution(eqx.Module):
@@ -116,31 +75,31 @@ class Solution(eqx.Module):
 
         `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m].
         """
-        return _over_times(_position, self, self._body(body), self._point(body, at))
+        return _over_times(Instant.position, self, self._body(body), self._point(body, at))
 
     def velocity(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
         """Velocity of a body's centre of mass, or of the point `at` on it [m/s]."""
-        return _over_times(_velocity, self, self._body(body), self._point(body, at))
+        return _over_times(Instant.velocity, self, self._body(body), self._point(body, at))
 
     def acceleration(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
         """Acceleration of a body's centre of mass, or of the point `at` on it [m/s²]."""
-        return _over_times(_acceleration, self, self._body(body), self._point(body, at))
+        return _over_times(Instant.acceleration, self, self._body(body), self._point(body, at))
 
     def orientation(self, body: str) -> Float[Array, "*batch n_t 3 3"]:
         """Axes of a body's reference frame, as columns."""
-        return _over_times(_orientation, self, self._body(body))
+        return _over_times(Instant.orientation, self, self._body(body))
 
     def angular_velocity(self, body: str) -> Float[Array, "*batch n_t 3"]:
         """Angular velocity of a body [rad/s]."""
-        return _over_times(_angular_velocity, self, self._body(body))
+        return _over_times(Instant.angular_velocity, self, self._body(body))
 
     def joint(self, name: str) -> Float[Array, "..."]:
         """Coordinate of a joint, in the tree or cut [rad or m]; (n_t, n) where it has several."""
-        return self._joint(_joint, name)
+        return self._joint(Instant.joint, name)
 
     def joint_speed(self, name: str) -> Float[Array, "..."]:
         """Speed of a joint, in the tree or cut [rad/s or m/s]."""
-        return self._joint(_joint_speed, name)
+        return self._joint(Instant.joint_speed, name)
 
     def reaction(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
         """What a joint or a constraint does.
@@ -159,8 +118,8 @@ class Solution(eqx.Module):
         `reaction_unique` tells which components can be relied upon.
         """
         if name in self.mechanism.topology.constraints:
-            return _over_times(_constraint_force, self, self.mechanism.topology.constraints.index(name))
-        return self._of_joint(_reactions, name, on, axes)
+            return _over_times(Instant.constraint_force, self, self.mechanism.topology.constraints.index(name))
+        return self._of_joint(Instant.reactions, name, on, axes)
 
     def reaction_unique(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
         """Which components of `reaction` the mechanics determine, as booleans of the same shapes.
@@ -170,12 +129,12 @@ class Solution(eqx.Module):
         depends on elasticity, assembly, and here on the choice of the tree.
         """
         if name in self.mechanism.topology.constraints:
-            return _over_times(_constraint_unique, self, self.mechanism.topology.constraints.index(name))
-        return self._of_joint(_unique, name, on, axes)
+            return _over_times(Instant.constraint_unique, self, self.mechanism.topology.constraints.index(name))
+        return self._of_joint(Instant.unique, name, on, axes)
 
     def reactions(self) -> dict[str, Reaction]:
         """The reactions of all joints on their children, in ground axes, by name."""
-        force, moment = _over_times(_reactions, self, "child", "ground")
+        force, moment = _over_times(Instant.reactions, self, "child", "ground")
         names = enumerate(self.mechanism.topology.joints)
         return {name: Reaction(force[..., index, :], moment[..., index, :]) for index, name in names}
 
@@ -185,15 +144,15 @@ class Solution(eqx.Module):
 
     def kinetic_energy(self) -> Float[Array, "*batch n_t"]:
         """Kinetic energy [J]."""
-        return _over_times(_kinetic_energy, self)
+        return _over_times(Instant.kinetic_energy, self)
 
     def potential_energy(self) -> Float[Array, "*batch n_t"]:
         """Potential energy of the force elements that have one [J]."""
-        return _over_times(_potential_energy, self)
+        return _over_times(Instant.potential_energy, self)
 
     def violation(self) -> Violation:
         """Largest violation of the loop rows at each time."""
-        return _over_times(_violation, self)
+        return _over_times(Instant.violation, self)
 
     def worst_violation(self) -> Violation:
         """Over all times, relative: to the run's largest speed and acceleration where those apply.
@@ -202,7 +161,7 @@ class Solution(eqx.Module):
         joints in radians and lengths of the mechanism; the square of a speed counts as an
         acceleration, since uniform motion of the joints accelerates the bodies.
         """
-        violation, (speed, acceleration) = self.violation(), _over_times(_largest, self)
+        violation, speed, acceleration = _over_times(Instant.violation_and_scales, self)
         largest = lambda values: jnp.max(jnp.where(jnp.isfinite(self.ts), values, 0.0), axis=-1)
         relative = lambda values, scale: values / jnp.where(scale > 0.0, scale, 1.0)
         return Violation(
@@ -213,11 +172,11 @@ class Solution(eqx.Module):
 
     def rank(self) -> Int[Array, "*batch n_t"]:
         """Number of independent loop rows."""
-        return _over_times(_rank, self)
+        return _over_times(Instant.rank, self)
 
     def singularity_distance(self) -> Float[Array, "*batch n_t"]:
         """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
-        return _over_times(_distance, self)
+        return _over_times(Instant.distance, self)
 
     def passages(self) -> Passages:
         """Times at which the motion goes through singular configurations, and the digits lost.
@@ -272,7 +231,7 @@ def _over_times(function, solution, *details):
     def of_member(solution, *details):
         system = system_of(solution.mechanism, solution.q.dtype)
         method = solution.accuracy.method(solution.q.dtype, solution.rank_nearby)
-        of_time = lambda t, q, v: function(_Instant(system, method, t, q, v), *details)
+        of_time = lambda t, q, v: function(Instant(system, method, t, q, v), *details)
         return jax.vmap(of_time)(solution.ts, solution.q, solution.v)
 
     for _ in range(solution.ts.ndim - 1):
@@ -287,122 +246,3 @@ def _evaluate(solution, t):
     t = jnp.asarray(t, dtype)
     y = solution.interpolation.evaluate(t)
     return Problem(solution.mechanism, system, method, solution.accuracy).close(t, y)
-
-
-def _arm(configuration, body, point):
-    return rotate(configuration.rotation[body], point)
-
-
-def _position(instant, body, point):
-    configuration = instant.configuration
-    return configuration.world_position()[body] + _arm(configuration, body, point)
-
-
-def _velocity(instant, body, point):
-    motion = instant.motion
-    arm = _arm(motion.configuration, body, point)
-    return motion.velocity[body] + cross(motion.angular_velocity[body], arm)
-
-
-def _acceleration(instant, body, point):
-    motion = instant.motion
-    arm, omega = _arm(motion.configuration, body, point), motion.angular_velocity[body]
-    angular, linear = body_accelerations(motion, instant.dynamics.acceleration)
-    return linear[body] + cross(angular[body], arm) + cross(omega, cross(omega, arm))
-
-
-def _orientation(instant, body):
-    return instant.configuration.rotation[body]
-
-
-def _angular_velocity(instant, body):
-    return instant.motion.angular_velocity[body]
-
-
-def _joint(instant, name):
-    return instant.configuration.joint_coordinates(name)
-
-
-def _joint_speed(instant, name):
-    return instant.motion.joint_speeds(name)
-
-
-def _least_multipliers(instant):
-    dynamics, configuration = instant.dynamics, instant.configuration
-    if not instant.system.topology.num_rows:
-        return LeastMultipliers(dynamics.multipliers, jnp.zeros((0, 0)))
-    tolerance = instant.method.rank_tolerance
-    rows, units = jacobian(configuration), instant.system.units
-    return least_multipliers(rows, dynamics.multipliers, units, tolerance, dynamics.rank)
-
-
-def _reactions(instant, on, axes):
-    found = reactions(instant.motion, instant.dynamics.acceleration, _least_multipliers(instant).multipliers)
-    return seen_from(instant.configuration, found, on, axes)
-
-
-def _constraint_force(instant, constraint):
-    multipliers = _least_multipliers(instant).multipliers
-    return sorted_multipliers(instant.configuration, multipliers).constraints[constraint]
-
-
-def _self_stresses(instant):
-    """Multipliers with Jᵀλ = 0, a row each: those of rows that motion changes, and of rows that none does."""
-    topology = instant.system.topology
-    immobile = len(topology.immobile_rotation_rows) + len(topology.immobile_translation_rows)
-    free = _least_multipliers(instant).free.T
-    size = len(free) + immobile
-    stresses = jnp.zeros((size, size), instant.q.dtype).at[: len(free), : len(free)].set(free)
-    stresses = stresses.at[len(free) :, len(free) :].set(jnp.eye(immobile))
-    return jnp.split(stresses, [len(free)], axis=1)
-
-
-def _unique(instant, on, axes):
-    configuration = instant.configuration
-
-    def changes(multipliers, immobile):
-        return seen_from(configuration, reactions_to(configuration, multipliers, immobile), on, axes)
-
-    force, moment = jax.vmap(changes)(*_self_stresses(instant))
-    # Multipliers are moments, forces times the length of their loop.
-    still = lambda change: jnp.max(jnp.abs(change), axis=0, initial=0.0) <= UNCHANGED
-    return Reaction(still(force * instant.system.length), still(moment))
-
-
-def _constraint_unique(instant, constraint):
-    topology = instant.system.topology
-    row = topology.num_rows - len(topology.constraints) + constraint
-    return jnp.max(jnp.abs(_self_stresses(instant)[0][:, row]), initial=0.0) <= UNCHANGED
-
-
-def _kinetic_energy(instant):
-    return kinetic_energy(instant.motion)
-
-
-def _potential_energy(instant):
-    return potential_energy(instant.configuration)
-
-
-def _violation(instant):
-    configuration = instant.configuration
-    position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
-    velocity = jacobian(configuration) @ instant.v - rate(instant.system, instant.t)
-    return Violation(*map(_size, (position, velocity, instant.dynamics.violation)))
-
-
-def _size(rows):
-    return jnp.max(jnp.abs(rows), initial=0.0)
-
-
-def _largest(instant):
-    units = instant.system.units
-    speed = _size(instant.v / units)
-    return speed, jnp.maximum(_size(instant.dynamics.acceleration / units), speed**2)
-
-
-def _rank(instant):
-    return instant.dynamics.rank
-
-
-def _distance(instant):
-    return instant.dynamics.distance

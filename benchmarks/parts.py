@@ -1,0 +1,24 @@
+"""What benchmarks with several tables share: choose some by `--part`, print rows as they come, or JSON."""
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+
+
+def print_parts(description: str, parts: dict[str, Callable[[], Iterator[dict]]]) -> None:
+    """The command line of a benchmark; each part yields the rows of a table."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", choices=parts, action="append", help="default: all")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
+    arguments = parser.parse_args()
+    found = {}
+    for name in arguments.part or parts:
+        found[name] = []
+        if not arguments.json:
+            print(f"\n{name}")
+        for row in parts[name]():
+            found[name].append(row)
+            if not arguments.json:
+                print("  " + "  ".join(f"{key} {entry}" for key, entry in row.items()), flush=True)
+    if arguments.json:
+        print(json.dumps(found))

@@ -1,0 +1,154 @@
+"""What can be read from one instant of a motion; `linkax.Solution` reads it at all its times."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from linkax.equations.configuration import configure
+from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
+from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
+from linkax.equations.motion import move
+from linkax.equations.reactions import Reaction, reactions, reactions_to, seen_from
+from linkax.equations.system import System
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
+from linkax.spatial.rotations import cross, rotate
+
+UNCHANGED = 1e-6  # by a self-stress of magnitude one
+
+
+class Violation(NamedTuple):
+    """Largest violation of the loop rows, at each time or over the run.
+
+    - `position`: c, rotation rows [rad], translation rows in lengths of the loop.
+    - `velocity`: J v [1/s]. `acceleration`: J v̇ − γ [1/s²].
+    """
+
+    position: Float[Array, "..."]
+    velocity: Float[Array, "..."]
+    acceleration: Float[Array, "..."]
+
+
+class Instant(NamedTuple):
+    """One saved time of a solution."""
+
+    system: System
+    method: TangentSpace
+    t: Float[Array, ""]
+    q: Float[Array, " n_q"]
+    v: Float[Array, " n_v"]
+
+    @property
+    def configuration(self):
+        return configure(self.system, self.t, self.q)
+
+    @property
+    def motion(self):
+        return move(self.configuration, self.v)
+
+    @property
+    def dynamics(self):
+        return self.method.dynamics(self.system, self.t, self.q, self.v)
+
+    def position(self, body, point):
+        configuration = self.configuration
+        return configuration.world_position()[body] + _arm(configuration, body, point)
+
+    def velocity(self, body, point):
+        motion = self.motion
+        arm = _arm(motion.configuration, body, point)
+        return motion.velocity[body] + cross(motion.angular_velocity[body], arm)
+
+    def acceleration(self, body, point):
+        motion = self.motion
+        arm, omega = _arm(motion.configuration, body, point), motion.angular_velocity[body]
+        angular, linear = body_accelerations(motion, self.dynamics.acceleration)
+        return linear[body] + cross(angular[body], arm) + cross(omega, cross(omega, arm))
+
+    def orientation(self, body):
+        return self.configuration.rotation[body]
+
+    def angular_velocity(self, body):
+        return self.motion.angular_velocity[body]
+
+    def joint(self, name):
+        return self.configuration.joint_coordinates(name)
+
+    def joint_speed(self, name):
+        return self.motion.joint_speeds(name)
+
+    def _least_multipliers(self):
+        dynamics, configuration = self.dynamics, self.configuration
+        if not self.system.topology.num_rows:
+            return LeastMultipliers(dynamics.multipliers, jnp.zeros((0, 0)))
+        tolerance = self.method.rank_tolerance
+        rows, units = jacobian(configuration), self.system.units
+        return least_multipliers(rows, dynamics.multipliers, units, tolerance, dynamics.rank)
+
+    def reactions(self, on, axes):
+        found = reactions(self.motion, self.dynamics.acceleration, self._least_multipliers().multipliers)
+        return seen_from(self.configuration, found, on, axes)
+
+    def constraint_force(self, constraint):
+        multipliers = self._least_multipliers().multipliers
+        return sorted_multipliers(self.configuration, multipliers).constraints[constraint]
+
+    def _self_stresses(self):
+        """Multipliers with Jᵀλ = 0, a row each: those of rows that motion changes, and of rows that none does."""
+        topology = self.system.topology
+        immobile = len(topology.immobile_rotation_rows) + len(topology.immobile_translation_rows)
+        free = self._least_multipliers().free.T
+        size = len(free) + immobile
+        stresses = jnp.zeros((size, size), self.q.dtype).at[: len(free), : len(free)].set(free)
+        stresses = stresses.at[len(free) :, len(free) :].set(jnp.eye(immobile))
+        return jnp.split(stresses, [len(free)], axis=1)
+
+    def unique(self, on, axes):
+        configuration = self.configuration
+
+        def changes(multipliers, immobile):
+            return seen_from(configuration, reactions_to(configuration, multipliers, immobile), on, axes)
+
+        force, moment = jax.vmap(changes)(*self._self_stresses())
+        # Multipliers are moments, forces times the length of their loop.
+        still = lambda change: jnp.max(jnp.abs(change), axis=0, initial=0.0) <= UNCHANGED
+        return Reaction(still(force * self.system.length), still(moment))
+
+    def constraint_unique(self, constraint):
+        topology = self.system.topology
+        row = topology.num_rows - len(topology.constraints) + constraint
+        return jnp.max(jnp.abs(self._self_stresses()[0][:, row]), initial=0.0) <= UNCHANGED
+
+    def kinetic_energy(self):
+        return kinetic_energy(self.motion)
+
+    def potential_energy(self):
+        return potential_energy(self.configuration)
+
+    def violation(self):
+        configuration = self.configuration
+        position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
+        velocity = jacobian(configuration) @ self.v - rate(self.system, self.t)
+        return Violation(*map(_size, (position, velocity, self.dynamics.violation)))
+
+    def violation_and_scales(self):
+        """The violation, and the largest speed and acceleration of the joints [1/s, 1/s²]."""
+        units = self.system.units
+        speed = _size(self.v / units)
+        return self.violation(), speed, jnp.maximum(_size(self.dynamics.acceleration / units), speed**2)
+
+    def rank(self):
+        return self.dynamics.rank
+
+    def distance(self):
+        return self.dynamics.distance
+
+
+def _arm(configuration, body, point):
+    return rotate(configuration.rotation[body], point)
+
+
+def _size(rows):
+    return jnp.max(jnp.abs(rows), initial=0.0)
