@@ -20,10 +20,11 @@ from linkax.equations import dynamics, loops
 from linkax.equations.configuration import bodies_of_cuts, configure
 from linkax.equations.coordinates import neutral, on_manifold, rates, retract
 from linkax.equations.motion import move
-from linkax.equations.reactions import cut_reactions, reactions
+from linkax.equations.reactions import cut_reactions, reactions, seen_from
 from linkax.equations.system import system_of
 from linkax.spatial.rotations import cross
 
+SIDES = ("child", "parent")
 DRAWS = settings(max_examples=4, deadline=None, derandomize=True, database=None)
 
 
@@ -105,6 +106,12 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     body = topology.column_body
     sign = jnp.where(topology.reversed[body], -1.0, 1.0)[:, None]
     left = jnp.sum(sign * (every.force[body] * configuration.sliding + every.moment[body] * configuration.angular), -1)
+    # On the parent, at its own frame: both sides of a joint balance about the world's origin.
+    on_parents = seen_from(configuration, every, "parent", "ground")
+    places = [jnp.stack([configuration.point(getattr(joint, side)) for joint in mechanism.joints]) for side in SIDES]
+    about_origin = [r.moment + cross(place, r.force) for r, place in zip((every, on_parents), places, strict=True)]
+    along_axes = seen_from(configuration, every, "child", "joint")
+    axes = [configuration.axes(joint.child) @ joint.frames()[1] for joint in mechanism.joints]
     solved = jnp.linalg.solve(mass, force + jacobian.T @ multipliers)
     energy = along(lambda t, q, v: kinetic_energy(system, t, q, v), solved)
     stored = along(lambda t, q, v: dynamics.potential_energy(configure(system, t, q)), solved)
@@ -124,6 +131,8 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
         "residual": (residual, rows(t, q, v)),
         "Table 3": (power + asked @ v, multipliers @ (jacobian @ v)),
         "tree joints": (left, mass @ acceleration - force - jacobian.T @ multipliers),
+        "parent's side": (about_origin[0], -about_origin[1]),
+        "joint axes": (jnp.einsum("jab,jb->ja", jnp.stack(axes), along_axes.moment), every.moment),
         "power in": (energy, applied @ v + multipliers @ (jacobian @ v)),
         "potential energy": (-stored, released @ v),
         "speeds": (v, jnp.concatenate([motion.joint_speeds(name) for name in topology.speeds])),
