@@ -111,7 +111,9 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     places = [jnp.stack([configuration.point(getattr(joint, side)) for joint in mechanism.joints]) for side in SIDES]
     about_origin = [r.moment + cross(place, r.force) for r, place in zip((every, on_parents), places, strict=True)]
     along_axes = seen_from(configuration, every, "child", "joint")
-    axes = [configuration.axes(joint.child) @ joint.frames()[1] for joint in mechanism.joints]
+    axes = [
+        configuration.rotation[configuration.body(joint.child.body)] @ joint.frames()[1] for joint in mechanism.joints
+    ]
     solved = jnp.linalg.solve(mass, force + jacobian.T @ multipliers)
     energy = along(lambda t, q, v: kinetic_energy(system, t, q, v), solved)
     stored = along(lambda t, q, v: dynamics.potential_energy(configure(system, t, q)), solved)

@@ -194,7 +194,7 @@ def _is_hinge(joint):
 
 def _draw_clock(axes, times):
     digits = max(2, 2 - int(np.floor(np.log10(times[-1]))))
-    clock = axes.text(0.5, 1.02, "", transform=axes.transAxes, ha="center", va="bottom", family="monospace", size=12)
+    clock = axes.set_title(" ", family="monospace", size=12)  # the layout leaves room for a title
     return _Actor(clock, lambda index: clock.set_text(f"t = {times[index]:.{digits}f} s"))
 
 
@@ -311,9 +311,11 @@ def _turns_right(first, second, third):
 
 
 def _draw_slides(axes, scenery):
-    """A box on each slide, turned along it."""
-    actors, height = [], SYMBOL_HEIGHT * scenery.unit
+    """A box on each slide, turned along it, smaller where bodies slide in each other."""
+    actors = []
     for joint in filter(_is_slide, scenery.mechanism.joints):
+        grounded = GROUND_NAME in (joint.parent.body, joint.child.body)
+        height = SYMBOL_HEIGHT * scenery.unit * (1.0 if grounded else 0.5)
         way, direction = _slide(scenery, joint)
         if direction is None:
             continue

@@ -22,8 +22,9 @@ def _section(index, mass):
 
 
 def _cylinder(name, mass, center, inertia):
-    """A part of the luffing cylinder, along x; mass [kg], centre of mass [m], inertia [kg m²]."""
-    return lx.RigidBody(name, mass, [center, 0.0, 0.0], [0.0, inertia, inertia])
+    """A part of the luffing cylinder, along x; mass [kg], centre of mass halfway [m], inertia [kg m²]."""
+    frames = {"end": [2.0 * center, 0.0, 0.0]}
+    return lx.RigidBody(name, mass, [center, 0.0, 0.0], [0.0, inertia, inertia], frames)
 
 
 def _mechanism(parameters):
