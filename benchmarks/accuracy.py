@@ -84,6 +84,7 @@ def trees():
                     both = np.asarray(a & b) & away[:, None]
                     assert np.all(np.asarray(a)[away] == np.asarray(b)[away]), (scene, cut, name)
                     apart = max(apart, np.max(np.abs(np.where(both, part - known, 0.0))))
+            jax.clear_caches()  # each compiled program holds memory maps, of which a process has 65 530
             yield {
                 "scene": scene,
                 "cut": cut,

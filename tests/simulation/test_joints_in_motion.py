@@ -56,6 +56,32 @@ def test_every_joint_type_passes_singular_configurations(name):
     assert found.closest < 0.05
 
 
+@pytest.mark.parametrize("carrier", [lx.Planar, lx.Free])
+def test_two_loops_that_share_a_coupler_are_singular_at_once(carrier):
+    """The coupler is carried from ground, and both its pins are cut."""
+    along = np.array([1.0, 0.0, 0.0])
+    crank, rocker = lx.rod("crank", 1.0, 1.0), lx.rod("rocker", 1.0, 1.0)
+    coupler = lx.RigidBody("coupler", 1.0, along / 2, [0.01, 1 / 12, 1 / 12], {"base": 0.0 * along, "tip": along})
+    in_plane = carrier is lx.Planar
+    options = {"axis": "z", "second_axis": "x"} if in_plane else {}
+    pin = lambda *ends: lx.Spherical(*ends, cut=True) if in_plane else lx.Revolute(*ends, "z", cut=True)
+    joints = [
+        lx.Revolute("A", lx.GROUND, crank.at("base"), "z"),
+        lx.Revolute("D", lx.GROUND.at([1.0, 0.0, 0.0]), rocker.at("base"), "z"),
+        carrier("carrier", lx.GROUND, coupler.at("base"), **options),
+        pin("B", crank.at("tip"), coupler.at("base")),
+        pin("C", coupler.at("tip"), rocker.at("tip")),
+    ]
+    mechanism = lx.Mechanism([crank, coupler, rocker], joints)
+    place = [0.0, 0.0, 1.0] if in_plane else [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    upright = {"A": np.pi / 2, "D": np.pi / 2, "carrier": place}
+    found = lx.simulate(mechanism, lx.assemble(mechanism, upright, {"A": 1.0, "D": 1.0}), t1=10.0, accuracy=lx.PRECISE)
+    turn = np.pi / 2 + found.ts
+    exact = np.stack([1.0 + np.cos(turn), np.sin(turn)], axis=-1)
+    assert np.max(np.abs(found.position("coupler", at="tip")[:, :2] - exact)) <= 1e-9
+    assert found.closest < 0.05
+
+
 def test_ten_cut_joints_move_like_one():
     kinds = (lx.Revolute,) * 4
     mechanism, state = rhombus(*kinds, copies=10, speed=-1.0, gravity=9.81)
