@@ -4,7 +4,8 @@ Parts, chosen by `--part`:
 
 - `answers`: largest error at all reference times, energy error, violations, for each preset.
 - `long-row`: the row of forty four-bars, 20 s, `PRECISE` (minutes).
-- `trees`: each joint of a loop cut in turn: largest difference of the motion and of unique reactions.
+- `trees`: each joint of a loop cut in turn: largest differences of positions [m] and of unique reactions
+  [N, N m], and both over the largest position and reaction.
 """
 
 import sys
@@ -78,6 +79,7 @@ def trees():
             if first is None:
                 first = places, reactions
             apart = 0.0
+            largest = max(np.max(np.abs(part)) for reaction, _ in first[1].values() for part in reaction)
             for name in cuts:
                 (reaction, unique), (reference, sure) = reactions[name], first[1][name]
                 for part, known, a, b in zip(reaction, reference, unique, sure, strict=True):
@@ -90,6 +92,10 @@ def trees():
                 "cut": cut,
                 "motion": float(np.max(np.abs(places - first[0]))),
                 "unique reactions": float(apart),
+                "relative": [
+                    float(f"{np.max(np.abs(places - first[0])) / np.max(np.abs(places)):.1e}"),
+                    float(f"{apart / largest:.1e}"),
+                ],
             }
 
 
