@@ -80,6 +80,9 @@ def test_nothing_holds_a_falling_body():
     mechanism = lx.Mechanism([body], [lx.Prismatic("slide", lx.GROUND, body, "y")], [lx.Gravity([0.0, -9.81, 0.0])])
     with pytest.raises(lx.EquilibriumError, match=r"no equilibrium near this state.*add what holds"):
         lx.equilibrium(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)))
+    # Where nothing can be raised it is marked.
+    marked = jax.vmap(lambda q: lx.equilibrium(mechanism, lx.State(q, jnp.zeros(1))).q)(jnp.zeros((2, 1)))
+    assert np.all(np.isnan(marked))
 
 
 def test_inverse_dynamics_undoes_the_dynamics():

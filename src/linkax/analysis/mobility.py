@@ -5,8 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from linkax.equations.configuration import configure
-from linkax.equations.loops import jacobian
 from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import least_multipliers
@@ -27,8 +25,8 @@ class Mobility(eqx.Module):
     - `rank`: number of independent constraints. `degrees_of_freedom`: of the speeds there; one more
       for each constraint that is lost in a singular configuration.
     - `num_redundant`: constraints that depend on others, those that no motion changes included.
-    - `distance`: from the nearest singular configuration, see `linkax.Accuracy`; 0 in one only where
-      it is approached along a motion: here that configuration has a smaller `rank`.
+    - `distance`: from the nearest singular configuration, see `linkax.Accuracy`. Exactly in one the
+      smaller `rank` tells, and not this.
     - `dispensable`: of each constraint row, in the order of `rows`, whether it could be left out
       without freeing anything.
     """
@@ -78,10 +76,8 @@ def mobility(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = 
 def _mobility(mechanism, state, t, accuracy):
     system, topology = system_of(mechanism, state.q.dtype), mechanism.topology
     tolerance = accuracy.method(system.dtype).rank_tolerance
-    inverse = Crossing.at(system, t, state.q, tolerance).inverse
-    rank = jnp.sum(inverse.rank)
-    rows = jacobian(configure(system, t, state.q))
-    immobile = len(topology.immobile_rotation_rows) + len(topology.immobile_translation_rows)
+    crossing = Crossing.at(system, t, state.q, tolerance)
+    rank, rows = jnp.sum(crossing.inverse.rank), crossing.jacobian
     dispensable = jnp.zeros(0, bool)
     if topology.num_rows:
         free = least_multipliers(rows, rows[:, 0], system.units, tolerance, rank).free
@@ -89,8 +85,8 @@ def _mobility(mechanism, state, t, accuracy):
     return Mobility(
         rank=rank,
         degrees_of_freedom=topology.num_speeds - rank,
-        num_redundant=topology.num_rows + immobile - rank,
-        distance=inverse.distance,
-        dispensable=jnp.concatenate([dispensable, jnp.ones(immobile, bool)]),
+        num_redundant=topology.num_rows + topology.num_immobile_rows - rank,
+        distance=crossing.inverse.distance,
+        dispensable=jnp.concatenate([dispensable, jnp.ones(topology.num_immobile_rows, bool)]),
         topology=topology,
     )

@@ -88,7 +88,9 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
     transformations nothing is raised, and coordinates are not finite then.
     """
     found, remaining = _equilibrium(mechanism, state, jnp.asarray(t, float))
-    if known(remaining) is not None and not remaining <= BALANCED_STEP:
+    if known(remaining) is None:
+        return State(jnp.where(remaining <= BALANCED_STEP, found.q, jnp.nan), found.v)
+    if not remaining <= BALANCED_STEP:
         raise EquilibriumError(
             f"no equilibrium near this state: step {MOST_STEPS} was still one of {float(remaining):.3g}, in radians or "
             "lengths of the mechanism; start elsewhere, or add what holds the mechanism",
@@ -132,15 +134,13 @@ def _equilibrium(mechanism, state, t):
     q, _ = method.close(system, t, lax.stop_gradient(q), rest)
     tangent = _Tangent.at(system, method, t, q)
     stiffness = lax.stop_gradient(tangent.stiffness())
-    values = jnp.linalg.svd(stiffness, compute_uv=False)
-    change = jnp.linalg.pinv(stiffness, rtol=NEUTRAL) @ tangent.acceleration(rest, rest)
-    change = tangent.basis @ jnp.where(jnp.max(values) > 0.0, change, 0.0)
+    change = tangent.basis @ (jnp.linalg.pinv(stiffness, rtol=NEUTRAL) @ tangent.acceleration(rest, rest))
     q, _ = method.close(system, t, retract(system.topology, q, change), rest)
     return State(q, rest), longest
 
 
 class Linearisation(NamedTuple):
-    """Small motions about a state: ÿ + damping ẏ + stiffness y = 0 on the tangent space, v = modes' basis × ẏ.
+    """Small motions about a state: ÿ + damping ẏ + stiffness y = 0 on the tangent space, v = basis × ẏ.
 
     With d degrees of freedom:
 
