@@ -68,6 +68,11 @@ class Topology:
         plain = len(self.rotation_rows) + len(self.translation_rows)
         return plain + len(self.combining) + len(self.constraints)
 
+    @property
+    def num_immobile_rows(self) -> int:
+        """Loop rows that no motion changes."""
+        return len(self.immobile_rotation_rows) + len(self.immobile_translation_rows)
+
     @cached_property
     def combining(self) -> tuple[int, ...]:
         """The cut joints with a combined row, counted from 0."""

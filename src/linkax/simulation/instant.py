@@ -98,7 +98,7 @@ class Instant(NamedTuple):
     def _self_stresses(self):
         """Multipliers with Jᵀλ = 0, a row each: those of rows that motion changes, and of rows that none does."""
         topology = self.system.topology
-        immobile = len(topology.immobile_rotation_rows) + len(topology.immobile_translation_rows)
+        immobile = topology.num_immobile_rows
         free = self._least_multipliers().free.T
         size = len(free) + immobile
         stresses = jnp.zeros((size, size), self.q.dtype).at[: len(free), : len(free)].set(free)

@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 
-from linkax.model.joints.joint import AbstractJoint
-from linkax.spatial.rotations import angle_about_first_axis, rotation_about_first_axis
+from linkax.model.joints.joint import AbstractJoint, hinged
+from linkax.spatial.rotations import angle_about_first_axis
 
 
 class Cylindrical(AbstractJoint):
@@ -19,9 +19,7 @@ class Cylindrical(AbstractJoint):
     aligned_axes = (0,)
     locked_translations = (1, 2)
 
-    @staticmethod
-    def rotation(coordinates):
-        return rotation_about_first_axis(coordinates[0])
+    rotation = staticmethod(hinged)
 
     @staticmethod
     def measure(rotation, separation):

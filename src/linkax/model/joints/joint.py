@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from linkax.model.bodies import Frame, frame_of
 from linkax.model.numbers import Constant, perpendicular_axis, unit_axis, value
-from linkax.spatial.rotations import frame_about_axis
+from linkax.spatial.rotations import frame_about_axis, rotation_about_first_axis
 
 
 class AbstractJoint(eqx.Module):
@@ -110,6 +110,11 @@ class AbstractJoint(eqx.Module):
     def combined(rotations, translations, number) -> Float[Array, ""]:
         """The row that combines others; `number` is the joint's own in units of ℓ."""
         raise NotImplementedError
+
+
+def hinged(coordinates) -> Float[Array, "3 3"]:
+    """The `rotation` of a joint that turns about h¹ by its first coordinate."""
+    return rotation_about_first_axis(coordinates[0])
 
 
 def unturned(coordinates) -> Float[Array, "3 3"]:

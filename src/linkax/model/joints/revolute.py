@@ -1,5 +1,5 @@
-from linkax.model.joints.joint import AbstractJoint
-from linkax.spatial.rotations import angle_about_first_axis, rotation_about_first_axis
+from linkax.model.joints.joint import AbstractJoint, hinged
+from linkax.spatial.rotations import angle_about_first_axis
 
 
 class Revolute(AbstractJoint):
@@ -16,9 +16,7 @@ class Revolute(AbstractJoint):
     aligned_axes = (0,)
     locked_translations = (0, 1, 2)
 
-    @staticmethod
-    def rotation(coordinates):
-        return rotation_about_first_axis(coordinates[0])
+    rotation = staticmethod(hinged)
 
     @staticmethod
     def measure(rotation, separation):

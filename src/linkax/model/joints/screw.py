@@ -2,9 +2,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from linkax.model.joints.joint import AbstractJoint
+from linkax.model.joints.joint import AbstractJoint, hinged
 from linkax.model.numbers import number, require
-from linkax.spatial.rotations import angle_about_first_axis, rotation_about_first_axis
+from linkax.spatial.rotations import angle_about_first_axis
 
 
 class Screw(AbstractJoint):
@@ -39,9 +39,7 @@ class Screw(AbstractJoint):
     def number(self):
         return self.pitch
 
-    @staticmethod
-    def rotation(coordinates):
-        return rotation_about_first_axis(coordinates[0])
+    rotation = staticmethod(hinged)
 
     @staticmethod
     def measure(rotation, separation):
