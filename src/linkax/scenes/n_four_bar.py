@@ -5,7 +5,10 @@ When all links lie in line the mechanism has N + 1 degrees of freedom for a mome
 
 import math
 
+import numpy as np
+
 import linkax as lx
+from linkax.scenes.closed_form import direction, pendulum_angle
 from linkax.scenes.scene import Scene, Variant
 
 
@@ -43,6 +46,15 @@ def _parallel(count, turn):
     )
 
 
+def _exact(parameters, times):
+    """Couplers only translate, so that the row moves like a pendulum of N + 1 links and N masses at their ends."""
+    count, length = parameters["N"], parameters["length"]
+    weight, inertia = (count + 1) / 2 + count, (count + 1) / 3 + count
+    stiffness = parameters["gravity"] / length * weight / inertia
+    angle = pendulum_angle(times, stiffness, parameters["angle"] + np.pi / 2, parameters["speed"]) - np.pi / 2
+    return {"B0": length * direction(angle)}
+
+
 N_FOUR_BAR = Scene(
     name="n-four-bar",
     summary="row of N parallelogram four-bars (A02 of the LIM/IFToMM library)",
@@ -63,4 +75,5 @@ N_FOUR_BAR = Scene(
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"B0": ("link_0", "tip")},
+    exact=_exact,
 )

@@ -1,6 +1,9 @@
 """Planar simple pendulum, problem A01 of the LIM/IFToMM benchmark library."""
 
+import numpy as np
+
 import linkax as lx
+from linkax.scenes.closed_form import direction, pendulum_angle
 from linkax.scenes.scene import Scene, Variant
 
 
@@ -16,6 +19,12 @@ def _mechanism(parameters):
 
 def _initial(mechanism, parameters):
     return lx.assemble(mechanism, {"pivot": parameters["angle"]}, {"pivot": parameters["speed"]})
+
+
+def _exact(parameters, times):
+    length, angle = parameters["length"], parameters["angle"]
+    turn = pendulum_angle(times, parameters["gravity"] / length, angle + np.pi / 2, parameters["speed"]) - np.pi / 2
+    return {"bob": length * direction(turn)}
 
 
 PENDULUM = Scene(
@@ -35,4 +44,5 @@ PENDULUM = Scene(
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"bob": ("link", "bob")},
+    exact=_exact,
 )

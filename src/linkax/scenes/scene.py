@@ -5,6 +5,8 @@ import math
 import operator
 from collections.abc import Callable, Mapping
 
+import numpy as np
+
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.state import State
@@ -38,6 +40,7 @@ class Scene:
     - `mechanism`: parameters -> `Mechanism`, a pure function; all but counts may be traced.
     - `initial`: (mechanism, parameters) -> `State`.
     - `points`: parameters -> {name: (body, frame of the body or None for its centre of mass)}.
+    - `exact`: (parameters, times [s]) -> {name of a point: positions (n_t, 3) [m]}, in closed form, or None.
 
     ```python
     parameters = scene.settings("SC2", {"speed": 3.0})
@@ -56,6 +59,7 @@ class Scene:
     mechanism: Callable[[Parameters], Mechanism]
     initial: Callable[[Mechanism, Parameters], State]
     points: Callable[[Parameters], dict[str, tuple[str, str | None]]]
+    exact: Callable[[Parameters, np.ndarray], dict[str, np.ndarray]] | None = None
 
     def variant(self, name: str | None = None) -> Variant:
         """The variant of that name, or the default one.
