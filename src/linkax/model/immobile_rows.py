@@ -12,10 +12,11 @@ from linkax.model.bodies import GROUND_NAME
 from linkax.model.numbers import Constant
 
 PARALLEL = 1e-14
+EVERY_ROW = (lambda i, j: True), (lambda i: True)
 
 
-def split_rows(carriers, predecessors, cuts) -> dict[str, tuple]:
-    """The rows of all cut joints, those that move and those that do not (see `Topology`)."""
+def split_rows(carriers, predecessors, cuts, all_rows=False) -> dict[str, tuple]:
+    """The rows of all cut joints, those that move and those that do not (see `Topology`); or all as if they moved."""
     orientation, carrier_of = {GROUND_NAME: np.eye(3)}, {}
     for joint, predecessor in zip(carriers, predecessors, strict=True):
         body = joint.child.body if joint.parent.body == predecessor else joint.parent.body
@@ -23,7 +24,7 @@ def split_rows(carriers, predecessors, cuts) -> dict[str, tuple]:
         carrier_of[body] = (joint, predecessor)
     rows = {"rotation_rows": [], "translation_rows": [], "immobile_rotation_rows": [], "immobile_translation_rows": []}
     for index, cut in enumerate(cuts):
-        rotates, translates = _mobile(cut, _loop(cut, carrier_of), orientation)
+        rotates, translates = EVERY_ROW if all_rows else _mobile(cut, _loop(cut, carrier_of), orientation)
         for i, j in cut.locked_rotations:
             rows["rotation_rows" if rotates(i, j) else "immobile_rotation_rows"].append((index, i, j))
         for i in cut.locked_translations:
@@ -60,18 +61,17 @@ def _loop(cut, carrier_of):
 
 def _mobile(cut, loop, orientation):
     """Two tests, whether the loop's motion changes h₁ⁱ·h₂ʲ and h₁ⁱ·s."""
-    everything = (lambda i, j: True), (lambda i: True)
     if any(not _is_structure(joint) or orientation[joint.parent.body] is None for joint in [cut, *loop]):
-        return everything
+        return EVERY_ROW
     if orientation[cut.child.body] is None:
-        return everything
+        return EVERY_ROW
     turns, slides = [], []
     for joint in [cut, *loop]:
         axes = orientation[joint.parent.body] @ joint.frames()[0]
         turns += [axes @ column for column in np.array(joint.angular_subspace) if np.any(column)]
         slides += [axes @ column for column in np.array(joint.linear_subspace) if np.any(column)]
     if turns and any(np.linalg.norm(np.cross(turns[0], turn)) > PARALLEL for turn in turns):
-        return everything
+        return EVERY_ROW
     parent_axes = orientation[cut.parent.body] @ cut.frames()[0]
     child_axes = orientation[cut.child.body] @ cut.frames()[1]
 

@@ -25,6 +25,8 @@ class Mechanism(eqx.Module):
 
     - `bodies`, `joints`, `forces`: sequences; names unique among bodies and among joints.
     - `constraints`: `Coupling`, `Drive` and `Distance`; names unique among joints and constraints.
+    - `all_rows`: keep those loop rows too that no motion changes, such as the out-of-plane rows of a planar
+      loop. It changes no motion; classical formulations fail on such rows.
 
     **Raises:** `ValueError` naming the element: a duplicate or unknown name, a body that no
     joint connects to ground, a joint with `cut=True` that closes no loop.
@@ -36,7 +38,7 @@ class Mechanism(eqx.Module):
     constraints: tuple[AbstractConstraint, ...]
     topology: Topology = eqx.field(static=True)
 
-    def __init__(self, bodies, joints, forces=(), constraints=()):
+    def __init__(self, bodies, joints, forces=(), constraints=(), *, all_rows=False):
         constraints = _checked(
             constraints, (AbstractConstraint, Distance), "constraints", "Coupling, Drive or Distance"
         )
@@ -68,7 +70,7 @@ class Mechanism(eqx.Module):
             parent=tuple(index[joint.parent.body] for joint in self.joints),
             child=tuple(index[joint.child.body] for joint in self.joints),
             joint_types=tuple(type(joint) for joint in self.joints),
-            **split_rows(carriers, predecessors, cuts),
+            **split_rows(carriers, predecessors, cuts, all_rows),
             constraints=tuple(constraint.name for constraint in constraints),
             constraint_terms=tuple(constraint.terms for constraint in constraints),
         )
