@@ -19,6 +19,14 @@ from linkax.analysis.vibration import equilibrium as equilibrium  # noqa: E402
 from linkax.analysis.vibration import linearise as linearise  # noqa: E402
 from linkax.equations.motion import Motion as Motion  # noqa: E402
 from linkax.equations.reactions import Reaction as Reaction  # noqa: E402
+from linkax.formulations.augmented_lagrangian import AugmentedLagrangian as AugmentedLagrangian  # noqa: E402
+from linkax.formulations.classical import Baumgarte as Baumgarte  # noqa: E402
+from linkax.formulations.classical import ClassicalFormulation as ClassicalFormulation  # noqa: E402
+from linkax.formulations.coordinate_partitioning import CoordinatePartitioning as CoordinatePartitioning  # noqa: E402
+from linkax.formulations.lagrange_multipliers import LagrangeMultipliers as LagrangeMultipliers  # noqa: E402
+from linkax.formulations.moore_penrose import MassOrthogonalProjection as MassOrthogonalProjection  # noqa: E402
+from linkax.formulations.moore_penrose import MoorePenrose as MoorePenrose  # noqa: E402
+from linkax.formulations.projection_operator import ProjectionOperator as ProjectionOperator  # noqa: E402
 from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402
 from linkax.linalg.pivoted_qr import pivoted_qr as pivoted_qr  # noqa: E402
 from linkax.model.bodies import GROUND as GROUND  # noqa: E402

@@ -12,33 +12,19 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from linkax.equations.configuration import Configuration, configure
+from linkax.equations.configuration import configure
 from linkax.equations.coordinates import on_manifold, retract, speeds
-from linkax.equations.dynamics import generalised_force, mass_matrix
-from linkax.equations.loops import gamma, is_driven, jacobian, rate, residual
+from linkax.equations.dynamics import generalised_force
+from linkax.equations.loops import gamma, is_driven, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.branches import Crossing
+from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
 from linkax.formulations.passage import Course, Value, limit
 from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert_apart, with_mass
 
 ROUNDING_ULPS = 8.0
 MOST_CORRECTIONS = 20
-
-
-class Dynamics(NamedTuple):
-    """What holds at a state on the manifold.
-
-    - `acceleration`: v̇, (n_v,). `multipliers`: λ, (m,).
-    - `rank`: independent loop rows. `distance`: see `linkax.linalg.constrained_solve.Inverse`.
-    - `violation`: J v̇ − γ, (m,).
-    """
-
-    acceleration: Float[Array, " n_v"]
-    multipliers: Float[Array, " m"]
-    rank: Int[Array, ""]
-    distance: Float[Array, ""]
-    violation: Float[Array, " m"]
 
 
 class Departure(NamedTuple):
@@ -53,24 +39,11 @@ class Departure(NamedTuple):
     definiteness: Float[Array, ""]
 
 
-class _Instant(NamedTuple):
-    """Loop rows and mass matrix at a configuration."""
-
-    configuration: Configuration
-    jacobian: Float[Array, "m n_v"]
-    mass: Float[Array, "n_v n_v"]
-
-
-def _at(system, t, q) -> _Instant:
-    configuration = configure(system, t, q)
-    return _Instant(configuration, jacobian(configuration), mass_matrix(configuration))
-
-
 def _largest(rows):
     return jnp.max(jnp.abs(rows), initial=0.0)
 
 
-class TangentSpace(eqx.Module):
+class TangentSpace(AbstractFormulation):
     """Corrections, accelerations and multipliers by the split of the space of speeds.
 
     - `rank_tolerance`: τ; a loop row is independent where |R_kk| > τ max(|R₁₁|, 1).
@@ -86,13 +59,18 @@ class TangentSpace(eqx.Module):
     metric: Literal["mass", "identity"] = eqx.field(static=True, default="mass")
     corrections: int = eqx.field(static=True, default=1)
 
-    def _weight(self, instant: _Instant):
+    @property
+    def nearest(self):
+        """Below the rank tolerance rows count as dependent."""
+        return self.rank_tolerance
+
+    def _weight(self, instant: Coefficients):
         """W of the corrections."""
         if self.metric == "mass":
             return instant.mass
         return jnp.diag(instant.configuration.system.units**-2)
 
-    def _split(self, instant: _Instant) -> Inverse:
+    def _split(self, instant: Coefficients) -> Inverse:
         weight = instant.mass if self.metric == "mass" else None
         system = instant.configuration.system
         islands = system.topology.islands
@@ -121,12 +99,12 @@ class TangentSpace(eqx.Module):
 
     def _corrected(self, system, t, q, v):
         """One factorisation, at q; then a fixed number of corrections with it."""
-        instant = _at(system, t, on_manifold(system.topology, q))
+        instant = coefficients(system, t, on_manifold(system.topology, q))
         split = self._split(instant)
         first = instant
         for _ in range(self.corrections):
             step = self._step(first, split, residual(instant.configuration))
-            instant = _at(system, t, retract(system.topology, instant.configuration.q, step))
+            instant = coefficients(system, t, retract(system.topology, instant.configuration.q, step))
         v = self._on_velocity_level(instant, v, split, sweeps=2)
         return v, instant, split
 
@@ -161,19 +139,19 @@ class TangentSpace(eqx.Module):
             v, instant, split = self._corrected(system, t, q, v)
             acceleration = self._acceleration(instant, v, split, sweeps=2)
         else:
-            instant = _at(system, t, q)
+            instant = coefficients(system, t, q)
             split = self._split(instant)
             acceleration = self._acceleration(instant, v, split, sweeps=1)
         return v, acceleration, instant.configuration.q, split.distance
 
     def crossing(self, system: System, t, q) -> Crossing:
         """The configuration as a crossing of branches."""
-        instant = _at(system, t, q)
+        instant = coefficients(system, t, q)
         return Crossing(instant.configuration, instant.jacobian, self._split(instant))
 
     def departure(self, system: System, t, q) -> "Departure":
         """What decides where a motion from rest goes."""
-        instant = _at(system, t, q)
+        instant = coefficients(system, t, q)
         split, rest = self._split(instant), jnp.zeros(system.topology.num_speeds, system.dtype)
         inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
         motion = move(instant.configuration, rest)
@@ -184,7 +162,7 @@ class TangentSpace(eqx.Module):
     @eqx.filter_jit
     def dynamics(self, system: System, t, q, v) -> Dynamics:
         """Accelerations and multipliers at a state on the manifold."""
-        instant = _at(system, t, q)
+        instant = coefficients(system, t, q)
         split = self._split(instant)
         motion = move(instant.configuration, v)
         force, right = generalised_force(motion), gamma(motion)
@@ -194,7 +172,7 @@ class TangentSpace(eqx.Module):
             (_, acceleration), _ = self._limit(_acceleration_at, (0, 2), system, t, q, v)
             _, multipliers = self._solve(split, instant, force, instant.jacobian @ acceleration, sweeps=1)
         violation = instant.jacobian @ acceleration - right
-        return Dynamics(acceleration, multipliers, jnp.sum(split.rank), split.distance, violation)
+        return Dynamics(acceleration, multipliers, violation)
 
     @eqx.filter_jit
     def close(self, system: System, t, q, v):
@@ -213,7 +191,7 @@ class TangentSpace(eqx.Module):
 
         def improve(carry):
             count, q, _, _, before, _ = carry
-            instant = _at(system, t, q)
+            instant = coefficients(system, t, q)
             split, rows = self._split(instant), residual(instant.configuration)
             gap = _largest(rows)
             done = (gap <= small) | (gap >= before)
@@ -228,12 +206,12 @@ class TangentSpace(eqx.Module):
 
     def _last_step(self, system, t, closed, q, v):
         """What `close` does near a closed state, as a function to be differentiated."""
-        instant = _at(system, t, closed)
+        instant = coefficients(system, t, closed)
         split, weight = self._split(instant), self._weight(instant)
         away = weight @ speeds(system.topology, closed, q - closed)
         rows = residual(instant.configuration)
         q = retract(system.topology, closed, constrained_solve(split, weight, instant.jacobian, away, -rows)[0])
-        instant = _at(system, t, q)
+        instant = coefficients(system, t, q)
         return q, self._on_velocity_level(instant, v, split, sweeps=2)
 
 

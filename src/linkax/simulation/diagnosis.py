@@ -37,6 +37,8 @@ def cause(solution, state) -> str:
     if (result == RESULTS.no_branch) | (result == RESULTS.not_unique):
         basis = Crossing.at(system, t, state.q, method.rank_tolerance).inverse.basis
         return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
+    if solution.formulation is not None and (found := _dependent_rows(solution, system, method, t)):
+        return found
     return _drives(solution, system, t) or _ahead(solution, system, t)
 
 
@@ -69,6 +71,19 @@ def _ahead(solution, system, t):
         if found := _forces(solution, system, t + ahead, solution.end):
             return found
     return ""
+
+
+def _dependent_rows(solution, system, method, t):
+    """A classical formulation that finds no acceleration where the run ends."""
+    end = solution.end
+    acceleration = solution.formulation.dynamics(system, t, end.q, end.v).acceleration
+    if np.all(np.isfinite(acceleration)):
+        return ""
+    rank, rows = int(np.sum(method.crossing(system, t, end.q).inverse.rank)), system.topology.num_rows
+    return (
+        f" The formulation finds no finite acceleration there: {rank} of the {rows} loop rows are independent. "
+        "The default formulation needs no independent rows."
+    )
 
 
 def _drives(solution, system, t):

@@ -12,6 +12,7 @@ from linkax.equations.loops import immobile_residual, jacobian, rate, residual, 
 from linkax.equations.motion import move
 from linkax.equations.reactions import Reaction, reactions, reactions_to, seen_from
 from linkax.equations.system import System
+from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
 from linkax.spatial.rotations import cross, rotate
@@ -32,10 +33,11 @@ class Violation(NamedTuple):
 
 
 class Instant(NamedTuple):
-    """One saved time of a solution."""
+    """One saved time of a solution: found by `method`, split into normal and tangent space by `tangent_space`."""
 
     system: System
-    method: TangentSpace
+    method: AbstractFormulation
+    tangent_space: TangentSpace
     t: Float[Array, ""]
     q: Float[Array, " n_q"]
     v: Float[Array, " n_v"]
@@ -80,12 +82,12 @@ class Instant(NamedTuple):
         return self.motion.joint_speeds(name)
 
     def _least_multipliers(self):
-        dynamics, configuration = self.dynamics, self.configuration
+        multipliers = self.dynamics.multipliers
         if not self.system.topology.num_rows:
-            return LeastMultipliers(dynamics.multipliers, jnp.zeros((0, 0)))
-        tolerance = self.method.rank_tolerance
-        rows, units = jacobian(configuration), self.system.units
-        return least_multipliers(rows, dynamics.multipliers, units, tolerance, dynamics.rank)
+            return LeastMultipliers(multipliers, jnp.zeros((0, 0)))
+        tolerance = self.tangent_space.rank_tolerance
+        rows, units = jacobian(self.configuration), self.system.units
+        return least_multipliers(rows, multipliers, units, tolerance, self.rank())
 
     def reactions(self, on, axes):
         found = reactions(self.motion, self.dynamics.acceleration, self._least_multipliers().multipliers)
@@ -139,11 +141,14 @@ class Instant(NamedTuple):
         speed = _size(self.v / units)
         return self.violation(), speed, jnp.maximum(_size(self.dynamics.acceleration / units), speed**2)
 
+    def _inverse(self):
+        return self.tangent_space.crossing(self.system, self.t, self.q).inverse
+
     def rank(self):
-        return self.dynamics.rank
+        return jnp.sum(self._inverse().rank)
 
     def distance(self):
-        return self.dynamics.distance
+        return self._inverse().distance
 
 
 def _arm(configuration, body, point):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from linkax.equations.coordinates import rates, speeds
 from linkax.equations.system import System
-from linkax.formulations.tangent_space import TangentSpace
+from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.state import State
@@ -42,7 +42,7 @@ class Problem(eqx.Module):
 
     mechanism: Mechanism
     system: System
-    method: TangentSpace
+    method: AbstractFormulation
     accuracy: Accuracy
     sound: Bool[Array, ""] = True
 
@@ -222,7 +222,8 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         return MechanismControl(self.controller.wrap(direction))
 
     @property
-    def _is_adaptive(self):
+    def is_adaptive(self) -> bool:
+        """Whether the controller inside chooses the steps by their errors."""
         inner = self.controller
         while hasattr(inner, "controller"):
             inner = inner.controller
@@ -230,7 +231,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         _, v = args.unpacked(y0)
-        if dt0 is None and self._is_adaptive:
+        if dt0 is None and self.is_adaptive:
             # Not diffrax's choice, which would compile the equations of motion twice more.
             fastest = jnp.max(jnp.abs(v / args.system.units), initial=0.0)
             turning = jnp.where(fastest > 0.0, FIRST_TURN / jnp.where(fastest > 0.0, fastest, 1.0), jnp.inf)
@@ -244,7 +245,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         scales = tuple(_magnitudes(args.unpacked(y), units) for y in (y0, y1_candidate))
         scaled = None
         if y_error.error is not None:
-            noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.rank_tolerance)
+            noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.nearest)
             scaled = tuple(_less(e / units, noise * scale) for e, scale in zip(y_error.error, scales[0], strict=True))
         before, retries = controller_state
         keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
@@ -254,8 +255,10 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         proceeds = next_t1 - next_t0 > SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t1), 1e-3)
         keep = keep & args.sound
         result = diffrax.RESULTS.where(keep | (proceeds & args.sound), result, diffrax.RESULTS.dt_min_reached)
-        if not self._is_adaptive:
-            return keep, next_t0, next_t1, jump, (after, retries), result
+        if not self.is_adaptive:
+            finite = jnp.all(jnp.isfinite(y1_candidate))
+            result = diffrax.RESULTS.where(finite, result, diffrax.RESULTS.dt_min_reached)
+            return keep & finite, jnp.where(finite, next_t0, t0), next_t1, jump, (after, retries), result
         near = jnp.minimum(args.accuracy.clearance, FEASIBLE * y_error.leaves)
         again = keep & (y_error.passes < near) & (retries < MOST_RETRIES)
         either = lambda retry, otherwise: jax.tree.map(lambda a, b: jnp.where(again, a, b), retry, otherwise)
@@ -276,12 +279,12 @@ def _magnitudes(state, units):
     return jnp.where(jnp.all(jnp.isfinite(q)), jnp.ones_like(v), jnp.nan), jnp.broadcast_to(fastest, v.shape)
 
 
-def _noise(distance, rank_tolerance):
-    """Rounding along the motion, relative: it grows like 1/d, up to where rows count as dependent.
+def _noise(distance, nearest):
+    """Rounding along the motion, relative: it grows like 1/d, up to 1/`nearest`.
 
     Across the motion it grows like 1/d², but that the correction takes off.
     """
-    return NOISE_ULPS * jnp.finfo(distance.dtype).eps / jnp.maximum(distance, rank_tolerance)
+    return NOISE_ULPS * jnp.finfo(distance.dtype).eps / jnp.maximum(distance, nearest)
 
 
 def _less(error, noise):

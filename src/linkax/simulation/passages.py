@@ -1,5 +1,6 @@
 """Passages through singular configurations, read off a motion's saved times."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,7 @@ class Passages(NamedTuple):
     - `times`: (n,), rising. Between two passages of the same loop there must be a saved time.
     - `digits`: decimal digits of the state that the run lost to them: rounding errors of the
       tangential motion grow like 1/d at the stages of steps, d the distance from a singular
-      configuration, and add up over the passages.
+      configuration, and add up over the passages. Not a number for a classical formulation.
     """
 
     times: np.ndarray
@@ -51,13 +52,20 @@ def passages(solution) -> Passages:
     times = np.sort((ts[intervals] + places * (ts[intervals + 1] - ts[intervals]))[vanished])
     spacing = np.max(np.diff(ts[: len(reached) + 1]), initial=0.0)
     times = times[np.diff(times, prepend=-np.inf) > TOGETHER * spacing]
+    if solution.formulation is not None:  # which does not measure how close its stages come
+        return Passages(times, math.nan)
     lost = np.log10(max(len(times), 1) / max(float(solution.closest), np.finfo(float).eps))
     return Passages(times, float(max(lost, 0.0)))
 
 
+def _eigenvalues(change):
+    """Ones where a motion that diverged has left no numbers."""
+    return np.linalg.eigvals(change) if np.all(np.isfinite(change)) else np.ones(len(change))
+
+
 def _turned(change):
     """The eigenvalues that have become negative."""
-    values = np.linalg.eigvals(change)
+    values = _eigenvalues(change)
     return values.real[values.real < -np.abs(values.imag)]
 
 
@@ -69,7 +77,7 @@ def _zeros(solution, intervals, ends):
         (a, f), (b, g) = low, high
         places = a + (b - a) * f / (f - g)
         changes, distances = _between(solution, intervals, places)
-        values = [np.linalg.eigvals(change).real for change in changes]
+        values = [_eigenvalues(change).real for change in changes]
         value = np.array([value[np.argmin(np.abs(value))] for value in values])
         low = np.where(value > 0.0, (places, value), low)
         high = np.where(value > 0.0, high, (places, value))

@@ -10,6 +10,7 @@ KNOWN_RESULTS = (
     "successful",
     "max_steps_reached",
     "dt_min_reached",
+    "diverged",
     "event_occurred",
     "not_closed",
     "no_branch",
@@ -33,7 +34,7 @@ def summary(run: TimedRun, points) -> dict:
     Violations are relative (`Solution.worst_violation`); `energy_error` is the largest change of
     the energy over the largest kinetic energy, or in joules where nothing moves. Of singular
     configurations: the smallest distance at a saved time, the times of passages [s], and the
-    digits that they cost (`Solution.passages`). What is not finite is None.
+    digits that they cost (`Solution.passages`). What is not finite, or not measured, is None.
     """
     solution = run.solution
     reached = np.isfinite(np.asarray(solution.ts))
@@ -56,7 +57,7 @@ def summary(run: TimedRun, points) -> dict:
         "rank_max": int(np.max(rank, initial=0)),
         "singularity_distance": _finite(np.min(np.asarray(solution.singularity_distance())[reached], initial=1.0)),
         "passages": [float(time) for time in passed.times],
-        "digits_lost": passed.digits,
+        "digits_lost": _finite(passed.digits),
         "result": result_name(solution.result),
         "message": "" if result_name(solution.result) == "successful" else str(RESULTS[solution.result]),
         "t_end": _finite(solution.t_end),

@@ -22,6 +22,9 @@ class RESULTS(diffrax.RESULTS):
         "Bodies without mass, or without inertia, can move freely, so that no acceleration follows from the forces on "
         "them. Give them mass and inertia, or a joint that holds them."
     )
+    diverged = (
+        "A step of fixed size led to numbers that are not finite. Take smaller steps, or let the step size adapt."
+    )
     not_finite = "The initial state, the numbers of the mechanism, or its forces there are not finite."
 
 

@@ -10,6 +10,7 @@ import diffrax
 import jax
 import numpy as np
 
+from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.results import RESULTS
@@ -38,6 +39,8 @@ def simulate_in_segments(
     t1: float,
     accuracy: Accuracy = BALANCED,
     solver: diffrax.AbstractSolver | None = None,
+    formulation: str | AbstractFormulation | None = None,
+    step: float | None = None,
     intervals: int = DEFAULT_INTERVALS,
     report: Callable[[str, float | None], None] = lambda phase, fraction: None,
 ) -> TimedRun:
@@ -48,7 +51,8 @@ def simulate_in_segments(
 
     **Arguments:**
 
-    - `mechanism`, `state`, `accuracy`, `solver`: see `linkax.simulate`.
+    - `mechanism`, `state`, `accuracy`, `solver`, `formulation`: see `linkax.simulate`.
+    - `step`: of fixed size [s], instead of steps that adapt.
     - `intervals`: between the saved times, a multiple of 20.
     - `report`: called with what happens now, and with the fraction done where that is known.
 
@@ -65,6 +69,9 @@ def simulate_in_segments(
             t1=end,
             accuracy=accuracy,
             solver=solver,
+            formulation=formulation,
+            dt0=step,
+            stepsize_controller=None if step is None else diffrax.ConstantStepSize(),
             saveat=diffrax.SaveAt(ts=times),
             throw=False,
         )

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from linkax.equations.system import system_of
+from linkax.formulations.formulation import AbstractFormulation
+from linkax.formulations.named import formulation as named_formulation
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.accuracy import BALANCED, Accuracy
@@ -29,6 +31,7 @@ def simulate(
     t1,
     t0=0.0,
     accuracy: Accuracy = BALANCED,
+    formulation: str | AbstractFormulation | None = None,
     saveat: diffrax.SaveAt | None = None,
     solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
@@ -48,6 +51,9 @@ def simulate(
       the closed loops first.
     - `accuracy`: tolerances and projection, `linkax.DRAFT`, `BALANCED` (default), `PRECISE`, or
       an `Accuracy` of one's own.
+    - `formulation`: of the equations of motion, default the paper's (`linkax.TangentSpace`). Or one of the
+      classical ones it is compared with, by name ("lagrange-multipliers+baumgarte") or as a
+      `linkax.ClassicalFormulation`; states are saved as it leaves them, on loops that drift open.
     - `saveat`: as in diffrax; default 201 times, evenly from t0 to t1. What is saved lies on the
       closed loops. A `fn` of its own gets (t, state, mechanism), the `State` closed.
     - `solver`: a diffrax solver, default `Dopri8`.
@@ -76,6 +82,10 @@ def simulate(
         raise ValueError(f"accuracy is {accuracy!r}; give linkax.DRAFT, BALANCED, PRECISE or linkax.Accuracy(rtol=...)")
     if stepsize_controller is None:
         stepsize_controller = diffrax.PIDController(rtol=accuracy.rtol, atol=accuracy.atol)
+    if isinstance(formulation, str):
+        formulation = named_formulation(formulation)
+    if not (formulation is None or isinstance(formulation, AbstractFormulation)):
+        raise ValueError(f"formulation is {formulation!r}; give a name, a linkax.ClassicalFormulation, or None")
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
     solution = _simulate(
         mechanism,
@@ -84,6 +94,7 @@ def simulate(
         t1,
         dt0 if dt0 is None else np.asarray(dt0, dtype=np.float64),
         accuracy,
+        formulation,
         saveat,
         Projected.around(diffrax.Dopri8() if solver is None else solver, accuracy, adjoint),
         MechanismControl(_traced_tolerances(stepsize_controller)),
@@ -173,6 +184,7 @@ def _simulate(
     t1,
     dt0,
     accuracy,
+    formulation,
     saveat,
     solver,
     controller,
@@ -182,13 +194,12 @@ def _simulate(
     max_steps,
     dtype,
 ):
-    mechanism, state, t0, t1, dt0, accuracy, saveat, controller = _cast(
-        (mechanism, state, t0, t1, dt0, accuracy, saveat, controller), dtype
+    mechanism, state, t0, t1, dt0, accuracy, formulation, saveat, controller = _cast(
+        (mechanism, state, t0, t1, dt0, accuracy, formulation, saveat, controller), dtype
     )
     system = system_of(mechanism, dtype)
-    method = accuracy.method(dtype)
-    outset = depart(method, system, t0, state)
-    method = eqx.tree_at(lambda m: m.rank_nearby, method, outset.rank, is_leaf=lambda leaf: leaf is None)
+    outset = depart(accuracy.method(dtype), system, t0, state)
+    method = accuracy.method(dtype, outset.rank) if formulation is None else formulation
     problem = Problem(mechanism, system, method, accuracy, outset.sound)
     if saveat is None:
         saveat = diffrax.SaveAt(ts=jnp.linspace(t0, t1, DEFAULT_SAVES, dtype=dtype))
@@ -227,6 +238,7 @@ def _simulate(
     return Solution(
         mechanism=mechanism,
         accuracy=accuracy,
+        formulation=formulation,
         ts=ts,
         q=q,
         v=v,
@@ -234,7 +246,7 @@ def _simulate(
         t_end=t_end[0],
         end=end,
         stats=found.stats,
-        result=_result(found.result, outset),
+        result=_result(found.result, outset, controller.is_adaptive),
         rank_nearby=outset.rank,
         closest=found.solver_state[2],
         interpolation=found.interpolation,
@@ -245,9 +257,11 @@ def _derivative(t, y, problem):
     return problem.derivative(t, y)
 
 
-def _result(result, outset):
+def _result(result, outset, is_adaptive):
     """The first of what is wrong at the start, else how the integration ended."""
     result = RESULTS.promote(result)
+    if not is_adaptive:
+        result = RESULTS.where(result == RESULTS.dt_min_reached, RESULTS.diverged, result)
     result = RESULTS.where(outset.unique, result, RESULTS.not_unique)
     result = RESULTS.where(outset.on_branch, result, RESULTS.no_branch)
     result = RESULTS.where(outset.closed, result, RESULTS.not_closed)

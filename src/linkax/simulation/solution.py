@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.equations.system import system_of
+from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number
 from linkax.simulation.accuracy import BALANCED, Accuracy
@@ -22,8 +23,9 @@ from linkax.simulation.state import State
 class Solution(eqx.Module):
     """A motion at the times `ts` [s].
 
+    - `formulation`: that of the run, None for the paper's.
     - `q`, `v`: coordinates and speeds of the tree's joints, (n_t, n_q) and (n_t, n_v), on the
-      closed loops. Times that were not reached hold infinity.
+      closed loops with the paper's formulation. Times that were not reached hold infinity.
     - `ys`: what a `SaveAt` with functions of its own saved; `q` and `v` are None then.
     - `t_end`, `end`: the time reached and the `State` there.
     - `stats`: as in diffrax: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
@@ -38,6 +40,7 @@ class Solution(eqx.Module):
 
     mechanism: Mechanism
     accuracy: Accuracy
+    formulation: AbstractFormulation | None
     ts: Float[Array, "*batch n_t"]
     q: Float[Array, "*batch n_t n_q"] | None
     v: Float[Array, "*batch n_t n_v"] | None
@@ -57,6 +60,7 @@ class Solution(eqx.Module):
         return Solution(
             mechanism=mechanism,
             accuracy=accuracy,
+            formulation=None,
             ts=t[None],
             q=state.q[None],
             v=state.v[None],
@@ -230,8 +234,9 @@ def _over_times(function, solution, *details):
 
     def of_member(solution, *details):
         system = system_of(solution.mechanism, solution.q.dtype)
-        method = solution.accuracy.method(solution.q.dtype, solution.rank_nearby)
-        of_time = lambda t, q, v: function(Instant(system, method, t, q, v), *details)
+        tangent_space = solution.accuracy.method(solution.q.dtype, solution.rank_nearby)
+        method = tangent_space if solution.formulation is None else solution.formulation
+        of_time = lambda t, q, v: function(Instant(system, method, tangent_space, t, q, v), *details)
         return jax.vmap(of_time)(solution.ts, solution.q, solution.v)
 
     for _ in range(solution.ts.ndim - 1):
@@ -242,7 +247,9 @@ def _over_times(function, solution, *details):
 @eqx.filter_jit
 def _evaluate(solution, t):
     dtype = solution.end.q.dtype
-    system, method = system_of(solution.mechanism, dtype), solution.accuracy.method(dtype, solution.rank_nearby)
+    system, method = system_of(solution.mechanism, dtype), solution.formulation
+    if method is None:
+        method = solution.accuracy.method(dtype, solution.rank_nearby)
     t = jnp.asarray(t, dtype)
     y = solution.interpolation.evaluate(t)
     return Problem(solution.mechanism, system, method, solution.accuracy).close(t, y)

@@ -1,0 +1,37 @@
+"""The augmented Lagrangian formulation, index 1."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.linalg import cho_factor, cho_solve
+
+from linkax.formulations.classical import AbstractAcceleration, parameter
+
+
+class AugmentedLagrangian(AbstractAcceleration):
+    """Penalties on the loop rows, and sweeps that make up for what they leave of J v̇ = γ open.
+
+    (M + Jᵀ S J) v̇ₖ₊₁ = M v̇ₖ + Jᵀ S γ from M v̇₀ = f; λₖ₊₁ = λₖ − S (J v̇ₖ₊₁ − γ). Bayo, García de Jalón and
+    Serna, Computer Methods in Applied Mechanics and Engineering 71, 1988; who stabilise as Baumgarte does, with
+    α = μΩ, β = Ω, most often Ω = 10 1/s and μ = 1. Rows may be redundant.
+
+    - `penalty`: S over the largest diagonal entry of M.
+    - `sweeps`: how often.
+    """
+
+    penalty: np.ndarray = parameter(1e7, "penalty of AugmentedLagrangian")
+    sweeps: int = eqx.field(static=True, default=10)
+
+    def __call__(self, mass, jacobian, force, gamma):
+        size = self.penalty * jnp.max(jnp.diagonal(mass))
+        factor = cho_factor(mass + size * jacobian.T @ jacobian)
+
+        def sweep(_, carry):
+            # The equation above less (M + JᵀSJ) v̇ₖ, so that rounding falls with what is left open.
+            acceleration, multipliers = carry
+            acceleration = acceleration - cho_solve(factor, size * jacobian.T @ (jacobian @ acceleration - gamma))
+            return acceleration, multipliers - size * (jacobian @ acceleration - gamma)
+
+        start = cho_solve(cho_factor(mass), force), jnp.zeros_like(gamma)
+        return lax.fori_loop(0, self.sweeps, sweep, start)

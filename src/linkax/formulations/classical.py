@@ -1,0 +1,134 @@
+"""The classical formulations: accelerations from a linear system, stabilised or corrected after steps."""
+
+import abc
+from functools import partial
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from linkax.equations.coordinates import on_manifold, retract
+from linkax.equations.dynamics import generalised_force
+from linkax.equations.loops import gamma, rate, residual
+from linkax.equations.motion import move
+from linkax.equations.system import System
+from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
+from linkax.model.numbers import known, number
+
+
+def parameter(default: float, what: str):
+    """A field for a traced number of a method, zero or more; `what` names it in errors."""
+    return eqx.field(default=default, converter=partial(_not_negative, what))
+
+
+def _not_negative(what, entry):
+    array = number(entry, (), what)
+    if known(array) is not None and known(array) < 0.0:
+        raise ValueError(f"{what} is {entry!r}; it must be zero or more")
+    return array
+
+
+class AbstractAcceleration(eqx.Module):
+    """A way to solve M v̇ = f + Jᵀλ, J v̇ = γ: numbers only, speeds in radians and lengths of the mechanism."""
+
+    @abc.abstractmethod
+    def __call__(
+        self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"], force: Float[Array, " n"], gamma
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """v̇ and λ, of at least one row; not finite where the way fails."""
+
+
+class AbstractCorrection(eqx.Module):
+    """A way back onto the loops, along a right inverse of J."""
+
+    @abc.abstractmethod
+    def right_inverse(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"]) -> Float[Array, "n m"]:
+        """G with J G r = r for r in the range of J: the loops are closed by the change −G c."""
+
+
+class Baumgarte(eqx.Module):
+    """Stabilisation by feedback: γ − 2α (J v − b) − β² c in place of γ.
+
+    Baumgarte, Computer Methods in Applied Mechanics and Engineering 1, 1972. α = β is critical
+    damping; 5 to 10 1/s are the values in use.
+
+    - `alpha`, `beta` [1/s]: zero for none.
+    """
+
+    alpha: np.ndarray = parameter(5.0, "alpha of Baumgarte [1/s]")
+    beta: np.ndarray = parameter(5.0, "beta of Baumgarte [1/s]")
+
+
+class ClassicalFormulation(AbstractFormulation):
+    """Accelerations of one of the classical methods, with a stabilisation and a correction as one likes.
+
+    ```python
+    lx.simulate(mechanism, state, t1=5.0, formulation=lx.ClassicalFormulation(
+        lx.LagrangeMultipliers(), stabilisation=lx.Baumgarte(10.0, 10.0), correction=lx.MassOrthogonalProjection()))
+    ```
+
+    Where `Accuracy.projection` is "both" or "step", states are corrected after each step, and saved states
+    always. Without a correction they are left as they are, so that what a method leaves of the loops open
+    can be seen. For comparison: through singular configurations, and for derivatives, take the paper's method.
+
+    - `acceleration`, `correction`: see there.
+    - `sweeps`: of the correction of positions after each step, Newton's method.
+    """
+
+    acceleration: AbstractAcceleration
+    stabilisation: Baumgarte = Baumgarte(0.0, 0.0)
+    correction: AbstractCorrection | None = None
+    sweeps: int = eqx.field(static=True, default=3)
+
+    @property
+    def nearest(self):
+        """Distances are not measured, and count as one."""
+        return 1.0
+
+    def _solved(self, at: Coefficients, v) -> Dynamics:
+        """v̇ and λ, and what v̇ violates of the rows without stabilisation."""
+        system, motion = at.configuration.system, move(at.configuration, v)
+        force, right, units = generalised_force(motion), gamma(motion), system.units
+        mass, rows = at.mass * units[:, None] * units, at.jacobian * units
+        if system.topology.num_rows == 0:
+            return Dynamics(units * jnp.linalg.solve(mass, units * force), right, right)
+        open_, rate_open = residual(at.configuration), at.jacobian @ v - rate(system, at.configuration.t)
+        alpha, beta = self.stabilisation.alpha, self.stabilisation.beta
+        stabilised = right - 2.0 * alpha * rate_open - beta**2 * open_
+        acceleration, multipliers = self.acceleration(mass, rows, units * force, stabilised)
+        acceleration = units * acceleration
+        return Dynamics(acceleration, multipliers, at.jacobian @ acceleration - right)
+
+    @eqx.filter_jit  # traced once, however often a solver asks
+    def derivative(self, system: System, t, q, v, correct: bool):
+        q = on_manifold(system.topology, q)
+        solved = self._solved(coefficients(system, t, q), v)
+        return v, solved.acceleration, q, jnp.ones((), q.dtype)
+
+    @eqx.filter_jit
+    def correct(self, system: System, t, q, v, errors=()):
+        q, one = on_manifold(system.topology, q), jnp.ones((), q.dtype)
+        if self.correction is None or system.topology.num_rows == 0:
+            return q, v, errors, one
+
+        def inverse(q):
+            at, units = coefficients(system, t, q), system.units
+            scaled = at.mass * units[:, None] * units, at.jacobian * units
+            return at, units[:, None] * self.correction.right_inverse(*scaled)
+
+        def closer(_, q):
+            at, back = inverse(q)
+            return retract(system.topology, q, -back @ residual(at.configuration))
+
+        q = lax.fori_loop(0, self.sweeps, closer, q)
+        at, back = inverse(q)
+        return q, v - back @ (at.jacobian @ v - rate(system, t)), errors, one
+
+    def close(self, system: System, t, q, v):
+        q, v, _, _ = self.correct(system, t, q, v)
+        return q, v
+
+    def dynamics(self, system: System, t, q, v) -> Dynamics:
+        return self._solved(coefficients(system, t, q), v)

@@ -1,0 +1,21 @@
+"""Generalised coordinate partitioning as a correction."""
+
+import numpy as np
+
+from linkax.formulations.classical import AbstractCorrection, parameter
+from linkax.linalg.right_inverse import by_partition
+
+
+class CoordinatePartitioning(AbstractCorrection):
+    """Dependent coordinates and speeds follow the independent ones.
+
+    Which are which, elimination with complete pivoting decides, anew in each correction. Wehage and Haug,
+    Journal of Mechanical Design 104, 1982.
+
+    - `tolerance`: a pivot below that much of the first one is none; its row is left out.
+    """
+
+    tolerance: np.ndarray = parameter(1e-8, "tolerance of CoordinatePartitioning")
+
+    def right_inverse(self, mass, jacobian):
+        return by_partition(jacobian, self.tolerance)

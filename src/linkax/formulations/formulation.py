@@ -1,0 +1,69 @@
+"""What a formulation is: how equations of motion with loops become an ordinary differential equation."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from linkax.equations.configuration import Configuration, configure
+from linkax.equations.dynamics import mass_matrix
+from linkax.equations.loops import jacobian
+from linkax.equations.system import System
+
+
+class Coefficients(NamedTuple):
+    """J and M of M v̇ = f + Jᵀλ, J v̇ = γ at a configuration."""
+
+    configuration: Configuration
+    jacobian: Float[Array, "m n_v"]
+    mass: Float[Array, "n_v n_v"]
+
+
+def coefficients(system: System, t, q) -> Coefficients:
+    """Loop rows and mass matrix at coordinates q."""
+    configuration = configure(system, t, q)
+    return Coefficients(configuration, jacobian(configuration), mass_matrix(configuration))
+
+
+class Dynamics(NamedTuple):
+    """What holds at a state.
+
+    - `acceleration`: v̇, (n_v,). `multipliers`: λ, (m,). `violation`: J v̇ − γ, (m,).
+    """
+
+    acceleration: Float[Array, " n_v"]
+    multipliers: Float[Array, " m"]
+    violation: Float[Array, " m"]
+
+
+class AbstractFormulation(eqx.Module):
+    """A way to accelerations of a mechanism with loops, and to states that keep the loops closed.
+
+    Pure functions of (system, t, q, v); see `linkax.TangentSpace` and `linkax.ClassicalFormulation`.
+    """
+
+    @property
+    @abc.abstractmethod
+    def nearest(self):
+        """The distance from a singular configuration below which rounding grows no more."""
+
+    @abc.abstractmethod
+    def derivative(self, system: System, t, q, v, correct: bool):
+        """v, v̇, the coordinates that they hold at, and the distance d from the nearest singular configuration.
+
+        `correct`: put the state on the loops before the equations of motion are formed. d is one where the
+        formulation does not measure it.
+        """
+
+    @abc.abstractmethod
+    def correct(self, system: System, t, q, v, errors=()):
+        """The state after a step, as the next step begins with it, what remains of `errors` in it, and d."""
+
+    @abc.abstractmethod
+    def close(self, system: System, t, q, v):
+        """q and v as they are saved and read."""
+
+    @abc.abstractmethod
+    def dynamics(self, system: System, t, q, v) -> Dynamics:
+        """Accelerations and multipliers at a saved state."""

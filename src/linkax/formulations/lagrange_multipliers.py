@@ -1,0 +1,30 @@
+"""Lagrange's equations of the first kind, index 1, for independent loop rows."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_factor, cho_solve
+
+from linkax.formulations.classical import AbstractAcceleration
+
+
+class LagrangeMultipliers(AbstractAcceleration):
+    """Accelerations and multipliers of the constrained equations, by LU; fails where J loses rank.
+
+    García de Jalón and Bayo, Kinematic and Dynamic Simulation of Multibody Systems, 1994, ch. 5.
+
+    - `block`: solve [[M, −Jᵀ], [J, 0]] at once; else (default) first (J M⁻¹ Jᵀ) λ = γ − J M⁻¹ f
+      for the multipliers.
+    """
+
+    block: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, mass, jacobian, force, gamma):
+        m, n = jacobian.shape
+        if self.block:
+            matrix = jnp.block([[mass, -jacobian.T], [jacobian, jnp.zeros((m, m), mass.dtype)]])
+            solved = jnp.linalg.solve(matrix, jnp.concatenate([force, gamma]))
+            return solved[:n], solved[n:]
+        factor = cho_factor(mass)
+        free, moved = cho_solve(factor, force), cho_solve(factor, jacobian.T)
+        multipliers = jnp.linalg.solve(jacobian @ moved, gamma - jacobian @ free)
+        return free + moved @ multipliers, multipliers

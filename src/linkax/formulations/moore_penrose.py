@@ -1,0 +1,58 @@
+"""Accelerations by the Moore-Penrose inverse of the loop rows in the mass metric."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from linkax.formulations.classical import AbstractAcceleration, AbstractCorrection, parameter
+from linkax.linalg.right_inverse import by_gram_schmidt, by_svd
+
+INVERSES = {"svd": by_svd, "gram-schmidt": by_gram_schmidt}
+
+
+def mass_orthogonal_inverse(mass, jacobian, inverse, tolerance):
+    """The right inverse of J whose columns are M-orthogonal to the tangent space: L⁻ᵀ (J L⁻ᵀ)⁺, M = L Lᵀ."""
+    lower = jnp.linalg.cholesky(mass)
+    weighted = solve_triangular(lower, jacobian.T, lower=True).T
+    return solve_triangular(lower.T, inverse(weighted, tolerance))
+
+
+class MoorePenrose(AbstractAcceleration):
+    """The free acceleration and the smallest one, in the mass metric, that satisfies the rows.
+
+    v̇ = a + M^(-1/2) B⁺ (γ − J a), a = M⁻¹ f, B = J M^(-1/2): Udwadia and Kalaba, Proceedings of the Royal
+    Society A 439, 1992. Rows may be redundant; multipliers are of minimum norm.
+
+    - `inverse`: B⁺ by "svd", or by "gram-schmidt" on the rows of B, as in Neto and Ambrósio, Multibody System
+      Dynamics 10, 2003.
+    - `tolerance`: singular values below that much of the largest one, and rows of which less than that much of their
+      length is left, count as zero.
+    """
+
+    inverse: Literal["svd", "gram-schmidt"] = eqx.field(static=True, default="svd")
+    tolerance: np.ndarray = parameter(1e-8, "tolerance of MoorePenrose")
+
+    def __check_init__(self):
+        if self.inverse not in INVERSES:
+            raise ValueError(f"inverse of MoorePenrose is {self.inverse!r}; known: {', '.join(map(repr, INVERSES))}")
+
+    def __call__(self, mass, jacobian, force, gamma):
+        back = mass_orthogonal_inverse(mass, jacobian, INVERSES[self.inverse], self.tolerance)
+        free = cho_solve(cho_factor(mass), force)
+        added = back @ (gamma - jacobian @ free)
+        return free + added, back.T @ (mass @ added)
+
+
+class MassOrthogonalProjection(AbstractCorrection):
+    """The smallest change in the mass metric: Blajer, Multibody System Dynamics 7, 2002.
+
+    - `tolerance`: see `MoorePenrose`.
+    """
+
+    tolerance: np.ndarray = parameter(1e-8, "tolerance of MassOrthogonalProjection")
+
+    def right_inverse(self, mass, jacobian):
+        return mass_orthogonal_inverse(mass, jacobian, by_svd, self.tolerance)
