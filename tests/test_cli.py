@@ -25,7 +25,12 @@ BAD = {
     "simulate n-four-bar --set N=2.5": "'N' of scene 'n-four-bar' is '2.5'; it must be an integer",
     "simulate n-four-bar --set N=0": "integer of at least 1",
     "simulate pendulum --preset best": "unknown 'best'; known: draft, balanced, precise",
-    "simulate pendulum --solver euler": "unknown 'euler'; known: tsit5, dopri5, dopri8",
+    "simulate pendulum --solver euler": "unknown 'euler'; known: tsit5, dopri5, dopri8, rk4",
+    "simulate pendulum --solver rk4": "--solver rk4 estimates no error; give its steps by --dt",
+    "simulate pendulum --formulation magic": "unknown formulation 'magic'; known: tangent-space, or one of lagrange-",
+    "compare pendulum --formulations tangent-space,lm": "unknown formulation 'lm'; known: tangent-space",
+    "compare pendulum --equal time": "unknown 'time'; known: tolerance, cost",
+    "compare pendulum --bound 0": "not a positive, finite number",
     "simulate pendulum --rtol 0": "'0' is not a positive, finite number",
     "simulate pendulum --rtol nan": "not a positive",
     "simulate pendulum --t1 -3": "positive, finite",
@@ -37,7 +42,7 @@ BAD = {
 
 @pytest.mark.parametrize("command", BAD)
 def test_bad_input_is_one_line_and_code_two(command, capsys, tmp_path):
-    out = ["--out", str(tmp_path), "--no-plots"] if command.startswith("simulate") else []
+    out = ["--out", str(tmp_path), "--no-plots"] if command.startswith(("simulate", "compare")) else []
     assert main([*command.split(), *out]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -87,3 +92,30 @@ def test_summary_for_people(capsys, tmp_path):
     for word in ("successful", "steps", "compile time", "run time", "position violation", "energy error", "bob"):
         assert word in printed
     assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "trajectory.npz"}
+
+
+def test_compare_prints_verdicts_and_keeps_them(capsys, tmp_path):
+    names = "tangent-space,lagrange-multipliers,moore-penrose-svd+partitioning"
+    command = ["compare", "pendulum", "--t1", "2", "--formulations", names, "--out", str(tmp_path)]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    kept = json.loads((tmp_path / "comparison.json").read_text())
+    assert kept["answer"] == "closed form"
+    assert kept["uncertainty"] < 1e-11
+    assert [trial["formulation"] for trial in kept["trials"]] == names.split(",")
+    for trial in kept["trials"]:
+        assert trial["verdict"] == "converged"
+        assert 1e-12 < trial["error"] < 1e-6
+        assert trial["evaluations"] == 13 * trial["steps"] + 1
+        assert trial["reached"] == 2.0
+    assert "diverged: the run ended early, or a point was off by more than 0.01 m" in printed
+    with Image.open(tmp_path / "comparison.png") as picture:
+        assert np.std(np.asarray(picture.convert("RGB"))) > 1.0
+
+
+def test_compare_at_equal_cost_chooses_among_tolerances(capsys, tmp_path):
+    command = ["compare", "pendulum", "--t1", "2", "--formulations", "lagrange-multipliers", "--equal", "cost"]
+    assert main([*command, "--out", str(tmp_path), "--json", "--no-plots"]) == 0
+    ours, other = json.loads(capsys.readouterr().out)["trials"]
+    assert (ours["formulation"], other["formulation"]) == ("tangent-space", "lagrange-multipliers")
+    assert other["run_s"] <= 1.01 * max(ours["run_s"], 1e-12) or other["rtol"] > 1e-8

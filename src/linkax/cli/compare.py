@@ -1,0 +1,148 @@
+"""`linkax compare SCENE`: formulations side by side."""
+
+import json
+import math
+from pathlib import Path
+
+import linkax as lx
+from linkax.cli.options import Run, add_run_options, end_progress, one_of, positive, progress, steps_in_words
+from linkax.formulations.named import ADDITIONS, BASES, COMPARED, TANGENT_SPACE, formulation
+from linkax.simulation.files import written_whole
+from linkax.studies.comparison import Comparison, Stepping, at_equal_cost, compare
+
+LADDER = (1e2, 1e1, 1.0, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances, of the one asked for, from which equal cost chooses
+STEP_LADDER = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # steps likewise
+TIGHTEST = 1e-13
+EQUAL = {"tolerance": "each at the same tolerance or step", "cost": "each in no more run time than the paper's needs"}
+
+
+def add_command(commands):
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "compare",
+        help="integrate a scene by all formulations, and compare errors, violations and cost",
+        epilog=f"A NAME is {TANGENT_SPACE} (the paper's), or one of {', '.join(BASES)}, with "
+        f"{', '.join(f'+{word}' for word in ADDITIONS)} added as one likes.",
+    )
+    parser.set_defaults(command=_compare)
+    add_run_options(parser)
+    names = "formulations, separated by commas (default: sixteen, about two minutes, most of it compiling)"
+    parser.add_argument("--formulations", default=",".join(COMPARED), metavar="NAME,...", help=names)
+    equal = "; ".join(f"{name}: {meaning}" for name, meaning in EQUAL.items())
+    parser.add_argument("--equal", default="tolerance", type=one_of(EQUAL), metavar="WHAT", help=equal)
+    parser.add_argument("--bound", type=positive, metavar="M", help="an error above it [m] counts as diverged")
+    parser.add_argument(
+        "--all-rows", action="store_true", help="with the loop rows too that no motion changes, which linkax leaves out"
+    )
+
+
+def _compare(arguments):
+    asked = Run(arguments)
+    names = {name.strip(): formulation(name.strip()) for name in arguments.formulations.split(",")}
+    if arguments.equal == "cost":
+        names = {TANGENT_SPACE: None} | names
+    mechanism = asked.mechanism
+    if arguments.all_rows:
+        parts = mechanism.bodies, mechanism.joints, mechanism.forces, mechanism.constraints
+        mechanism = lx.Mechanism(*parts, all_rows=True)
+    out = Path("linkax-out") / f"compare-{asked.scene.name}" if arguments.out is None else arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    exact = asked.scene.exact
+    found = compare(
+        mechanism,
+        asked.initial(mechanism),
+        asked.points,
+        t1=asked.t1,
+        steppings=_steppings(asked, arguments),
+        formulations=names,
+        exact=None if exact is None else lambda times: exact(asked.parameters, times),
+        bound=arguments.bound,
+        report=progress,
+    )
+    trials = found.trials
+    if arguments.equal == "cost":
+        own = Stepping(asked.solver, float(asked.accuracy.rtol), arguments.dt)
+        budget = next(t.run_s for t in trials if t.formulation == TANGENT_SPACE and (t.step or t.rtol) == _size(own))
+        trials = at_equal_cost(trials, budget)
+    described = asked.described | {
+        "equal": EQUAL[arguments.equal],
+        "all_rows": arguments.all_rows,
+        **found._asdict(),
+        "verdicts": _verdicts(found),
+        "trials": [_finite(trial._asdict()) for trial in trials],
+    }
+    with written_whole(out / "comparison.json") as path:
+        path.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
+    files = [out / "comparison.json"]
+    if not arguments.no_plots:
+        from linkax.plotting.comparison import plot_comparison  # matplotlib takes its time
+
+        with written_whole(out / "comparison.png") as path:
+            plot_comparison(found).savefig(path, dpi=130, format="png")
+        files.append(out / "comparison.png")
+    end_progress()
+    print(json.dumps(described, allow_nan=False) if arguments.json else _for_people(described, found, trials, files))
+    return 0
+
+
+def _steppings(asked, arguments):
+    """The one asked for, or those that equal cost chooses from."""
+    if arguments.dt is not None:
+        factors = STEP_LADDER if arguments.equal == "cost" else (1.0,)
+        return [Stepping(asked.solver, step=arguments.dt * factor) for factor in factors]
+    rtol = float(asked.accuracy.rtol)
+    if arguments.equal == "tolerance":
+        return [Stepping(asked.solver, rtol=rtol)]
+    return [
+        Stepping(asked.solver, rtol=rtol * factor) for factor in LADDER if factor >= 1.0 or rtol * factor >= TIGHTEST
+    ]
+
+
+def _finite(entries):
+    """None in place of numbers that JSON does not have."""
+    bad = lambda entry: isinstance(entry, float) and not math.isfinite(entry)
+    return {name: None if bad(entry) else entry for name, entry in entries.items()}
+
+
+def _size(stepping):
+    return stepping.rtol if stepping.step is None else stepping.step
+
+
+def _verdicts(found: Comparison) -> str:
+    """What the verdicts mean."""
+    return f"diverged: the run ended early, or a point was off by more than {found.bound:.3g} m; else converged"
+
+
+def _for_people(described, found, trials, files):
+    rows = [("formulation", "error [m]", "c", "J v - b", "J a - γ", "energy", "steps", "f(y)", "run [ms]", "verdict")]
+    for trial in trials:
+        size = "" if described["equal"] == EQUAL["tolerance"] else f" ({_size(trial):.0e})"
+        violations = (trial.position_violation, trial.velocity_violation, trial.acceleration_violation)
+        rows.append(
+            (
+                trial.formulation + size,
+                *(f"{number:.1e}" for number in (trial.error, *violations, trial.energy_error)),
+                str(trial.steps),
+                str(trial.evaluations or ""),
+                f"{1e3 * trial.run_s:.1f}",
+                trial.verdict,
+            )
+        )
+    widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
+    line = lambda row: "  ".join(
+        [row[0].ljust(widths[0]), *(e.rjust(w) for e, w in zip(row[1:], widths[1:], strict=True))]
+    )
+    answer = found.answer if found.answer == "closed form" else f"{found.answer}, good to {found.uncertainty:.0e} m"
+    why = [f"  {trial.formulation}: {trial.why}" for trial in trials if trial.why]
+    return "\n".join(
+        [
+            f"{described['scene']} {described['variant']}, {described['t1']:g} s, {described['solver']}, "
+            f"{steps_in_words(described)}; {described['equal']}",
+            f"error: largest distance from the {answer}; c, J v - b, J a - γ: worst violations, relative",
+            described["verdicts"],
+            "",
+            *map(line, rows),
+            *(["", "why diverged:", *why] if why else []),
+            "written: " + ", ".join(map(str, files)),
+        ]
+    )

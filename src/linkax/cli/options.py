@@ -1,0 +1,113 @@
+"""What the commands share: options, how they are read, and a line on what happens now."""
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import diffrax
+
+import linkax as lx
+from linkax.scenes import scene
+from linkax.simulation.runge_kutta import RungeKutta4
+
+PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
+SOLVERS = {name.lower(): getattr(diffrax, name) for name in ("Tsit5", "Dopri5", "Dopri8")} | {"rk4": RungeKutta4}
+
+
+def add_run_options(parser):
+    """The scene, its parameters, and how it is integrated."""
+    parser.add_argument("scene", metavar="SCENE", help="a scene of `linkax list`")
+    parser.add_argument("--variant", help="a variant of the scene (default: its first)")
+    parser.add_argument("--t1", type=positive, metavar="S", help="end time [s]")
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="NAME=VALUE", help="a parameter")
+    parser.add_argument("--preset", default="balanced", type=one_of(PRESETS), help=f"{', '.join(PRESETS)}")
+    parser.add_argument("--rtol", type=positive, metavar="X", help="tolerance of a step, instead of the preset's")
+    parser.add_argument("--solver", default="dopri8", type=one_of(SOLVERS), help=f"{', '.join(SOLVERS)}")
+    parser.add_argument("--dt", type=positive, metavar="S", help="fixed steps [s], instead of ones that adapt")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the files (default: under linkax-out)")
+    parser.add_argument("--no-plots", action="store_true", help="write no pictures")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
+
+
+class Run:
+    """What the options of `add_run_options` ask for."""
+
+    def __init__(self, arguments):
+        if arguments.solver == "rk4" and arguments.dt is None:
+            raise ValueError("--solver rk4 estimates no error; give its steps by --dt")
+        self.scene = scene(arguments.scene)
+        self.variant = self.scene.default_variant if arguments.variant is None else arguments.variant
+        self.parameters = self.scene.settings(self.variant, _changes(arguments.changes))
+        self.t1 = self.scene.duration(self.variant) if arguments.t1 is None else arguments.t1
+        self.accuracy = PRESETS[arguments.preset] if arguments.rtol is None else lx.Accuracy(rtol=arguments.rtol)
+        self.solver = SOLVERS[arguments.solver]()
+        self.mechanism = self.scene.mechanism(self.parameters)
+        self.points = self.scene.points(self.parameters)
+        self.described = {
+            "scene": self.scene.name,
+            "variant": self.variant,
+            "t1": self.t1,
+            "preset": arguments.preset if arguments.rtol is None and arguments.dt is None else None,
+            "rtol": float(self.accuracy.rtol) if arguments.dt is None else None,
+            "step": arguments.dt,
+            "solver": arguments.solver,
+            "parameters": {name: float(entry) for name, entry in self.parameters.items()},
+        }
+
+    def initial(self, mechanism):
+        """The start, assembled."""
+        progress("assembling", None)
+        return self.scene.initial(mechanism, self.parameters)
+
+
+def positive(text):
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive, finite number")
+    return number
+
+
+def one_of(choices):
+    def read(text):
+        if text.lower() not in choices:
+            raise argparse.ArgumentTypeError(f"unknown {text!r}; known: {', '.join(choices)}")
+        return text.lower()
+
+    return read
+
+
+def _changes(assignments):
+    changes = {}
+    for assignment in assignments:
+        name, equals, value = assignment.partition("=")
+        if not equals:
+            raise ValueError(f"--set {assignment!r} has no '='; write --set NAME=VALUE")
+        changes[name.strip()] = value.strip()
+    return changes
+
+
+def progress(phase, fraction):
+    """Tell a person what happens now; on one line where the terminal allows it."""
+    text = phase if fraction is None else f"{phase} {100 * fraction:.0f} %"
+    if sys.stderr.isatty():
+        print(f"\r{text:<60}", end="", file=sys.stderr, flush=True)
+    elif fraction is None or fraction == 0.0:
+        print(f"{phase} ...", file=sys.stderr, flush=True)
+
+
+def end_progress():
+    """Clear the line on what happens now."""
+    if sys.stderr.isatty():
+        print("\r" + 60 * " " + "\r", end="", file=sys.stderr)
+
+
+def steps_in_words(described) -> str:
+    """How the run steps, for people."""
+    if described["step"] is not None:
+        return f"fixed steps of {described['step']:g} s"
+    preset = "" if described["preset"] is None else f"{described['preset']}, "
+    return f"{preset}rtol {described['rtol']:g}"

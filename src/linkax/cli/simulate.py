@@ -1,0 +1,98 @@
+"""`linkax simulate SCENE`: one run, its trajectory and its pictures."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from linkax.cli.options import Run, add_run_options, end_progress, progress, steps_in_words
+from linkax.formulations.named import TANGENT_SPACE, formulation
+from linkax.simulation.diagnosis import cause
+from linkax.simulation.files import written_whole
+from linkax.simulation.report import summary, trajectory
+from linkax.simulation.segments import simulate_in_segments
+
+INTERVALS = 1000
+SHOWN = 5
+WORTH_TELLING = 0.05  # distance from a singular configuration
+
+
+def add_command(commands):
+    """Add the command to the parser."""
+    parser = commands.add_parser("simulate", help="simulate a scene and write its trajectory and pictures")
+    parser.set_defaults(command=_simulate)
+    add_run_options(parser)
+    parser.add_argument("--formulation", default=TANGENT_SPACE, metavar="NAME", help="see `linkax compare --help`")
+
+
+def _simulate(arguments):
+    asked, chosen = Run(arguments), formulation(arguments.formulation)
+    out = Path("linkax-out") / asked.scene.name if arguments.out is None else arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    state = asked.initial(asked.mechanism)
+    run = simulate_in_segments(
+        asked.mechanism,
+        state,
+        t1=asked.t1,
+        accuracy=asked.accuracy,
+        solver=asked.solver,
+        formulation=chosen,
+        step=arguments.dt,
+        intervals=INTERVALS,
+        report=progress,
+    )
+    progress("reading results", None)
+    found = asked.described | {"formulation": arguments.formulation} | summary(run, asked.points)
+    with written_whole(out / "trajectory.npz") as path:
+        np.savez(path, **trajectory(run.solution, asked.points))
+    with written_whole(out / "summary.json") as path:
+        path.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n")
+    files = [out / "trajectory.npz", out / "summary.json"]
+    if not arguments.no_plots:
+        progress("drawing", None)
+        from linkax.plotting.pictures import write_pictures  # matplotlib takes its time
+
+        files += write_pictures(run.solution, asked.points, out)
+    end_progress()
+    print(json.dumps(found, allow_nan=False) if arguments.json else _for_people(found, files))
+    if found["result"] == "successful":
+        return 0
+    stopped = f"the run stopped at t = {found['t_end']:.6g} s: {found['message']}{cause(run.solution, state)}"
+    print(f"linkax: {stopped}", file=sys.stderr)
+    return 1
+
+
+def _for_people(found, files):
+    final = [f"  {name:<22}{', '.join(f'{part:.9g}' for part in place)} m" for name, place in found["final"].items()]
+    lines = [
+        f"{found['scene']} {found['variant']}, {found['t1']:g} s, {found['formulation']}, {found['solver']}, "
+        + steps_in_words(found),
+        f"  result                {found['result']}",
+        f"  steps                 {found['steps']} ({found['rejected_steps']} of them rejected)",
+        f"  compile time          {found['compile_s']:.2f} s",
+        f"  run time              {1e3 * found['run_s']:.1f} ms",
+        f"  position violation    {found['position_violation']:.1e} of the loop's length",
+        f"  velocity violation    {found['velocity_violation']:.1e} of the largest speed",
+        f"  acceleration violation {found['acceleration_violation']:.1e} of the largest acceleration",
+        f"  energy error          {found['energy_error']:.1e} of the largest kinetic energy",
+        f"  independent loop rows {found['rank_min']} to {found['rank_max']}",
+        *_of_singular_configurations(found),
+        *final,
+        "written: " + ", ".join(map(str, files)),
+    ]
+    return "\n".join(lines)
+
+
+def _of_singular_configurations(found):
+    """Lines on singular configurations, where the run came close to one."""
+    lines = []
+    if found["passages"]:
+        count, times = len(found["passages"]), ", ".join(f"{time:.6g}" for time in found["passages"][:SHOWN])
+        more = "" if count <= SHOWN else ", ..."
+        lines.append(f"  singular passages     {count}, at {times}{more} s")
+    elif found["singularity_distance"] < WORTH_TELLING:
+        lines.append(f"  singular configuration as near as {found['singularity_distance']:.1e} (1 is far)")
+    if lines and found["digits_lost"] is not None:
+        lines.append(f"  digits lost to that   {found['digits_lost']:.1f} of 16")
+    return lines

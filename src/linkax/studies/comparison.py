@@ -1,0 +1,239 @@
+"""Formulations side by side on one mechanism."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import diffrax
+import jax
+import numpy as np
+
+from linkax.equations.system import system_of
+from linkax.formulations.formulation import AbstractFormulation
+from linkax.formulations.named import COMPARED
+from linkax.formulations.named import formulation as named
+from linkax.formulations.shared_program import in_shared_programs
+from linkax.model.mechanism import Mechanism
+from linkax.simulation.accuracy import Accuracy
+from linkax.simulation.diagnosis import cause
+from linkax.simulation.report import result_name
+from linkax.simulation.results import RESULTS
+from linkax.simulation.simulate import DEFAULT_MAX_STEPS, DEFAULT_SAVES, simulate
+from linkax.simulation.solution import Solution
+from linkax.simulation.state import State
+
+TIGHTEST, NEXT_TO_IT = 1e-13, 1e-12  # tolerances of the reference and of its check
+DIVERGED = 1e-2  # of the mechanism's length
+OPEN = 1e-3  # violation of positions [rad, or lengths of the loop]
+INSTANT = 1e-6  # of the whole time
+REPEATS, LONG_RUN = 3, 0.5  # a run that takes longer [s] is timed once
+STOPPED = {
+    "dt_min_reached": "the step size fell to nothing",
+    "max_steps_reached": "out of steps",
+    "diverged": "numbers were no longer finite",
+}
+
+
+class Trial(NamedTuple):
+    """One run of a formulation.
+
+    - `rtol` of adaptive steps, or `step` of fixed ones [s]; the other is None.
+    - `error`: largest distance of any point from the known answer, at all times reached [m].
+    - `position_violation`, `velocity_violation`, `acceleration_violation`: see `Solution.worst_violation`.
+    - `energy_error`: largest difference from the reference run's energy, over its largest kinetic energy.
+    - `steps`, `evaluations`: of the solver, and of the equations of motion in them. `run_s`: wall time [s].
+    - `reached` [s]. `verdict`: "converged", or "diverged": the run ended early, or its error is above the bound.
+    - `why`: how it diverged, in words.
+    """
+
+    formulation: str
+    rtol: float | None
+    step: float | None
+    error: float
+    position_violation: float
+    velocity_violation: float
+    acceleration_violation: float
+    energy_error: float
+    steps: int
+    evaluations: int | None
+    run_s: float
+    reached: float
+    verdict: str
+    why: str
+
+
+class Comparison(NamedTuple):
+    """What was compared, and with what.
+
+    - `answer`: the known answer: "closed form", or the reference run, the paper's formulation at a tolerance of 1e-13.
+    - `uncertainty`: how far the reference run is from the closed form, or from a run at 1e-12 [m].
+    - `bound`: an error above counts as diverged [m]. `passages`: through singular configurations [s].
+    """
+
+    answer: str
+    uncertainty: float
+    bound: float
+    passages: list[float]
+    trials: list[Trial]
+
+
+class Stepping(NamedTuple):
+    """Adaptive steps to a tolerance, or fixed steps [s]."""
+
+    solver: diffrax.AbstractSolver
+    rtol: float | None = None
+    step: float | None = None
+
+
+def compare(
+    mechanism: Mechanism,
+    state: State,
+    points: Mapping[str, tuple[str, str | None]],
+    *,
+    t1: float,
+    steppings: Sequence[Stepping],
+    formulations: Mapping[str, AbstractFormulation | None] | Sequence[str] = COMPARED,
+    exact: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None = None,
+    bound: float | None = None,
+    report: Callable[[str, float | None], None] = lambda phase, fraction: None,
+) -> Comparison:
+    """Integrate the same motion from 0 to t1 [s] by several formulations.
+
+    **Arguments:**
+
+    - `mechanism`, `state`: see `linkax.simulate`.
+    - `points`: {name: (body, frame of the body or None for its centre of mass)}, whose positions are compared.
+    - `steppings`: how to step; every formulation is run with each of them.
+    - `formulations`: names of `linkax.formulations.named`, or {name of one's own: formulation}.
+    - `exact`: times -> positions of the points, (n_t, 3) each [m], where they are known in closed form.
+    - `bound`: of the error [m]; default: a hundredth of the mechanism's length.
+    - `report`: called with what happens now, and with the fraction done where that is known.
+
+    **Returns:** a `Comparison`, of trials in the order of formulations, for each of these of steppings.
+    """
+    chosen = dict(formulations) if isinstance(formulations, Mapping) else {name: named(name) for name in formulations}
+    shared = iter(in_shared_programs([entry for entry in chosen.values() if entry is not None]))
+    chosen = {name: None if entry is None else next(shared) for name, entry in chosen.items()}
+    times = np.linspace(0.0, t1, DEFAULT_SAVES)
+    positions = lambda found: {name: np.asarray(found.position(*point)) for name, point in points.items()}
+
+    def run(formulation, stepping, times=times):
+        return jax.block_until_ready(_run(mechanism, state, times, formulation, stepping))
+
+    report("compiling the reference run", None)
+    reference = run(None, Stepping(diffrax.Dopri8(), rtol=TIGHTEST))
+    answer = positions(reference) if exact is None else exact(times)
+    other = run(None, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT)) if exact is None else reference
+    bound = DIVERGED * float(system_of(mechanism, float).length) if bound is None else bound
+    passages = [float(passage) for passage in reference.passages().times]
+    trials = []
+    for count, (name, formulation) in enumerate(chosen.items()):
+        report(f"running {name}", count / len(chosen))
+        for stepping in steppings:
+            run(formulation, stepping, INSTANT * times)  # compiles, where no formulation before it has
+            found, seconds = _timed(lambda formulation=formulation, stepping=stepping: run(formulation, stepping))
+            apart = _apart(positions(_plain(found)), answer)
+            trials.append(_trial(name, stepping, found, seconds, apart, bound, reference, passages, state))
+    uncertainty = float(np.max(_apart(positions(other), answer)))
+    return Comparison("reference run" if exact is None else "closed form", uncertainty, bound, passages, trials)
+
+
+def _run(mechanism, state, times, formulation, stepping) -> Solution:
+    fixed, most = {}, DEFAULT_MAX_STEPS
+    if stepping.step is not None:
+        fixed = {"dt0": stepping.step, "stepsize_controller": diffrax.ConstantStepSize()}
+        most = max(DEFAULT_MAX_STEPS, int(2.0 * times[-1] / stepping.step))
+    return simulate(
+        mechanism,
+        state,
+        t1=times[-1],
+        accuracy=Accuracy(rtol=TIGHTEST if stepping.rtol is None else stepping.rtol),
+        formulation=formulation,
+        solver=stepping.solver,
+        saveat=diffrax.SaveAt(ts=times),
+        max_steps=most,
+        throw=False,
+        **fixed,
+    )
+
+
+def _timed(run):
+    """What a run finds, and the shortest time that it takes [s]."""
+    shortest = np.inf
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        found = run()
+        shortest = min(shortest, time.perf_counter() - began)
+        if shortest > LONG_RUN:
+            break
+    return found, shortest
+
+
+def _plain(found) -> Solution:
+    """The same motion, read by programs that all formulations share."""
+    return dataclasses.replace(found, formulation=None)
+
+
+def _apart(positions, answer):
+    """Largest distance of any point at each time [m], zero where the run did not come."""
+    distances = [np.linalg.norm(positions[name] - answer[name], axis=-1) for name in answer if name in positions]
+    return np.nan_to_num(np.max(distances, axis=0), nan=0.0)
+
+
+def _trial(name, stepping, found, seconds, apart, bound, reference, passages, state) -> Trial:
+    finished = bool(found.result == RESULTS.successful)
+    reached = np.isfinite(np.asarray(found.ts))
+    energy = np.asarray(_plain(found).energy() - reference.energy())[reached]
+    error = float(np.max(apart))
+    verdict = "converged" if finished and error <= bound else "diverged"
+    why = ""
+    if not finished:
+        why = f"stopped at {float(found.t_end):.4g} s: {STOPPED.get(result_name(found.result), 'failed')}."
+        why += cause(found, state)
+    elif verdict == "diverged":
+        first = int(np.argmax(apart > bound))
+        gap = float(found.violation().position[first])
+        loops = f"loops open by {gap:.0e}" if gap > OPEN else f"loops closed to {gap:.0e}"
+        why = f"off by more than {bound:.2g} m at {found.ts[first]:.4g} s, {loops}"
+        before = [passage for passage in passages if passage <= found.ts[first]]
+        why += f"; last singular passage at {before[-1]:.4g} s." if before else "."
+    worst = found.worst_violation()
+    steps = int(found.stats["num_steps"])
+    return Trial(
+        formulation=name,
+        rtol=stepping.rtol,
+        step=stepping.step,
+        error=error,
+        position_violation=float(worst.position),
+        velocity_violation=float(worst.velocity),
+        acceleration_violation=float(worst.acceleration),
+        energy_error=float(np.max(np.abs(energy), initial=0.0) / np.max(np.asarray(reference.kinetic_energy()))),
+        steps=steps,
+        evaluations=_evaluations(stepping.solver, steps),
+        run_s=seconds,
+        reached=float(found.t_end),
+        verdict=verdict,
+        why=why,
+    )
+
+
+def _evaluations(solver, steps) -> int | None:
+    """Evaluations of the equations of motion in so many steps of a Runge-Kutta method."""
+    tableau = getattr(solver, "tableau", None)
+    if tableau is None:
+        return None
+    return steps * (tableau.num_stages - tableau.fsal) + int(tableau.fsal)
+
+
+def at_equal_cost(trials: Sequence[Trial], budget_s: float) -> list[Trial]:
+    """Of each formulation the trial of the smallest error among those that took no longer than `budget_s` [s].
+
+    Where none did, the fastest one.
+    """
+    found = []
+    for name in dict.fromkeys(trial.formulation for trial in trials):
+        own = [trial for trial in trials if trial.formulation == name]
+        finished = [trial for trial in own if trial.verdict == "converged" and trial.run_s <= budget_s]
+        found.append(min(finished, key=lambda t: t.error) if finished else min(own, key=lambda t: t.run_s))
+    return found
