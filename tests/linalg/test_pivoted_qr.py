@@ -8,16 +8,18 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.linalg.pivoted_qr import ENTRIES, TOGETHER, pivoted_qr
 
 SHAPES = {"tall": (7, 4), "wide": (4, 7), "square": (6, 6), "row": (1, 5), "column": (5, 1)}
 
 factorise = jax.jit(pivoted_qr)
+factorise_batch = jax.jit(jax.vmap(pivoted_qr))
 
 
-def assert_factorisation(a, tolerance=1e-14):
+def assert_factorisation(a, tolerance=1e-14, factors=None):
     """A P = Q R with Q orthogonal and R upper trapezoidal, its diagonal falling."""
-    q, r, order = map(np.asarray, factorise(a))
+    q, r, order = map(np.asarray, factors or factorise(a))
     n, m = a.shape
     scale = max(np.linalg.norm(a), np.finfo(a.dtype).tiny)
     assert sorted(order) == list(range(m))
@@ -121,7 +123,7 @@ def test_zero_rows_and_columns():
 @pytest.mark.parametrize("shape", [SHAPES["tall"], SHAPES["wide"]])
 def test_a_batch_equals_its_members(shape):
     batch = np.random.default_rng(2).normal(size=(8, *shape))
-    together = jax.jit(jax.vmap(pivoted_qr))(batch)
+    together = factorise_batch(batch)
     for index, a in enumerate(batch):
         q, r, order = factorise(a)
         np.testing.assert_array_equal(together.order[index], order)
@@ -149,3 +151,135 @@ def test_one_loop_whatever_the_size():
     texts = [factorise.lower(jnp.zeros(shape)).as_text() for shape in [(5, 3), (50, 30), (30, 50)]]
     assert [text.count("stablehlo.while") for text in texts] == [1, 1, 1]
     assert len({text.count("\n") for text in texts}) == 1
+
+
+# Enough to be factorised together, in several parts that do not come out even.
+MEMBERS = 5 * TOGETHER + 4
+RANK = 2
+
+
+def batch_of_kinds(shape, seed):
+    """(MEMBERS, n, m) with every kind of matrix in turn, and the number of pivots that are determined in each."""
+    rng = np.random.default_rng(seed)
+    n, m = shape
+    batch, determined = rng.normal(size=(MEMBERS, n, m)), np.full(MEMBERS, min(n, m))
+    graded, deficient, zero, duplicated = (slice(first, None, 5) for first in range(1, 5))
+    batch[graded] *= rng.permutation(np.logspace(-12, 0, m))
+    batch[deficient] = batch[deficient, :, :RANK] @ rng.normal(size=(RANK, m))
+    batch[zero] = 0.0
+    batch[duplicated, :, 1] = batch[duplicated, :, 0]
+    determined[deficient], determined[zero], determined[duplicated] = RANK, 0, 0
+    return batch, determined
+
+
+@pytest.mark.parametrize("shape", [SHAPES["tall"], SHAPES["wide"], SHAPES["square"]])
+def test_a_large_batch_is_like_its_members_and_like_lapack(shape):
+    batch, determined = batch_of_kinds(shape, seed=5)
+    together = zip(*map(np.asarray, factorise_batch(batch)), strict=True)
+    for a, pivots, factors in zip(batch, determined, together, strict=True):
+        r, order = assert_factorisation(a, factors=factors)
+        _, expected, lapack_order = scipy.linalg.qr(a, pivoting=True)
+        _, r_by_itself, order_by_itself = factorise(a)
+        scale = np.linalg.norm(a)
+        for other_r, other_order in [(expected, lapack_order), (r_by_itself, order_by_itself)]:
+            np.testing.assert_array_equal(order[:pivots], other_order[:pivots])
+            np.testing.assert_allclose(np.abs(np.diagonal(r)), np.abs(np.diagonal(other_r)), atol=1e-13 * scale)
+        if pivots == min(shape):
+            np.testing.assert_array_equal(order, lapack_order)
+            np.testing.assert_allclose(np.abs(r), np.abs(expected), atol=1e-13 * scale)
+            np.testing.assert_allclose(r, r_by_itself, atol=1e-13 * scale)
+
+
+def test_small_columns_of_a_large_batch_to_their_own_size():
+    sizes = np.logspace(-12, 0, 6)
+    batch = np.random.default_rng(6).normal(size=(MEMBERS, *SHAPES["square"]))
+    batch *= sizes / np.linalg.norm(batch, axis=1, keepdims=True)
+    _, r, order = factorise_batch(batch)
+    np.testing.assert_allclose(np.linalg.norm(r, axis=1), sizes[order], rtol=1e-13)
+
+
+def test_a_batch_of_batches():
+    batch, _ = batch_of_kinds(SHAPES["square"], seed=7)
+    nested = jax.jit(jax.vmap(jax.vmap(pivoted_qr), in_axes=1, out_axes=1))(batch.reshape(4, -1, *batch.shape[1:]))
+    for part, flat in zip(nested, factorise_batch(batch), strict=True):
+        np.testing.assert_allclose(part.reshape(flat.shape), flat, atol=1e-14)
+
+
+def test_a_large_batch_in_single_precision():
+    batch = np.random.default_rng(8).normal(size=(MEMBERS, *SHAPES["square"])).astype(np.float32)
+    q, r, order = map(np.asarray, factorise_batch(batch))
+    assert q.dtype == r.dtype == np.float32
+    for a, *factors in zip(batch, q, r, order, strict=True):
+        assert_factorisation(a, tolerance=10 * np.finfo(np.float32).eps, factors=factors)
+
+
+def test_members_that_are_not_finite_keep_to_themselves():
+    batch, _ = batch_of_kinds(SHAPES["square"], seed=9)
+    spoilt = batch.copy()
+    spoilt[3, 1, 2], spoilt[70, 0, 0] = np.nan, np.inf
+    _, expected, _ = factorise_batch(batch)
+    _, r, order = factorise_batch(spoilt)
+    others = np.delete(np.arange(MEMBERS), [3, 70])
+    np.testing.assert_array_equal(r[others], expected[others])
+    assert not np.isfinite(r[3]).all()
+    assert not np.isfinite(r[70]).all()
+    np.testing.assert_array_equal(np.sort(order, axis=1), np.broadcast_to(np.arange(6), order.shape))
+    np.testing.assert_array_equal(np.sort(factorise(spoilt[3]).order), np.arange(6))
+
+
+def test_a_large_batch_in_loops_of_different_length():
+    """A batched `while_loop` in which each member is factorised as often as it says."""
+
+    def repeated(a, times):
+        return jax.lax.while_loop(lambda c: c[1] < times, lambda c: (pivoted_qr(c[0]).r, c[1] + 1), (a, 0))[0]
+
+    batch, _ = batch_of_kinds(SHAPES["square"], seed=10)
+    times = np.arange(MEMBERS) % 2
+    found = jax.jit(jax.vmap(repeated))(batch, times)
+    expected = np.where(times[:, None, None] == 1, factorise_batch(batch).r, batch)
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+def test_derivatives_of_solves_in_a_large_batch():
+    """Forward and reverse, inside and outside of `vmap`, are those of the members one after another."""
+    rng = np.random.default_rng(11)
+    rows, direction = rng.normal(size=(2, ENTRIES // 12 + 1, 2, 4))
+    mass, force = np.diag([1.0, 2.0, 3.0, 4.0]), np.arange(4.0)
+
+    def size(rows):
+        jacobian = rows[jnp.array([0, 1, 0])]
+        inverse = invert(mass, jacobian, jnp.ones(4), 1e-9)
+        return jnp.sum(constrained_solve(inverse, mass, jacobian, force, jnp.array([1.0, 2.0, 1.0]))[0] ** 2)
+
+    @jax.jit
+    def all_of_them(rows, direction):
+        total = lambda rows: jnp.sum(jax.vmap(size)(rows))
+        return (
+            jax.lax.map(jax.grad(size), rows),
+            jax.vmap(jax.grad(size))(rows),
+            jax.grad(total)(rows),
+            jax.jvp(jax.vmap(size), (rows,), (direction,))[1],
+            jax.linearize(jax.vmap(size), rows)[1](direction),
+        )
+
+    expected, inside, outside, forward, linear = all_of_them(rows, direction)
+    scale = np.max(np.abs(expected))
+    for found in (inside, outside):
+        np.testing.assert_allclose(found, expected, atol=1e-11 * scale)
+    for found in (forward, linear):
+        np.testing.assert_allclose(found, np.sum(expected * direction, axis=(1, 2)), atol=1e-10 * scale)
+
+
+def test_a_large_batch_compiles_alike_whatever_the_sizes():
+    texts = [
+        factorise_batch.lower(jnp.zeros(shape)).as_text() for shape in [(600, 5, 3), (4096, 50, 30), (200, 30, 50)]
+    ]
+    assert len({text.count("stablehlo.while") for text in texts}) == 1
+
+
+def test_an_accelerator_gets_one_loop_of_large_operations():
+    traced = factorise_batch.trace(jnp.zeros((MEMBERS, *SHAPES["square"])))
+    loops = {
+        name: traced.lower(lowering_platforms=(name,)).as_text().count("stablehlo.while") for name in ("cpu", "cuda")
+    }
+    assert loops["cuda"] == 1 < loops["cpu"]
