@@ -1,10 +1,13 @@
 """Integration of a mechanism's motion in time."""
 
+from typing import Any, NamedTuple
+
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
@@ -87,14 +90,16 @@ def simulate(
     if not (formulation is None or isinstance(formulation, AbstractFormulation)):
         raise ValueError(f"formulation is {formulation!r}; give a name, a linkax.ClassicalFormulation, or None")
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-    solution = _simulate(
+    # Compiled apart, so that another solver, formulation or saveat compiles no more than it must.
+    mechanism, accuracy, outset = _start(mechanism, state, t0, accuracy, dtype)
+    found, formulation = _integrate(
         mechanism,
-        state,
+        accuracy,
+        outset,
+        formulation,
         t0,
         t1,
         dt0 if dt0 is None else np.asarray(dt0, dtype=np.float64),
-        accuracy,
-        formulation,
         saveat,
         Projected.around(diffrax.Dopri8() if solver is None else solver, accuracy, adjoint),
         MechanismControl(_traced_tolerances(stepsize_controller)),
@@ -102,8 +107,8 @@ def simulate(
         event,
         diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
         max_steps,
-        dtype,
     )
+    solution = _read(mechanism, accuracy, outset, formulation, t0, found, _saves_states(saveat))
     if throw and known(solution.ts) is not None:
         _raise_if_failed(solution, state)
     return solution
@@ -177,14 +182,45 @@ def _cast(tree, dtype):
 
 
 @eqx.filter_jit
-def _simulate(
+def _start(mechanism, state, t0, accuracy, dtype):
+    """Mechanism and accuracy in the floating-point type of the run, and the state on the loops."""
+    mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
+    return mechanism, accuracy, depart(accuracy.method(dtype), system_of(mechanism, dtype), t0, state)
+
+
+def _problem(mechanism, accuracy, outset, formulation) -> Problem:
+    dtype = outset.state.q.dtype
+    method = accuracy.method(dtype, outset.rank) if formulation is None else formulation
+    return Problem(mechanism, system_of(mechanism, dtype), method, accuracy, outset.sound)
+
+
+def _saves_states(saveat) -> bool:
+    """Whether states are saved, and not functions of them."""
+    return saveat is None or (isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is _SAVE_STATE)
+
+
+class _Found(NamedTuple):
+    """What the integration leaves: times and values saved, those at its end, and how it ended."""
+
+    ts: Any
+    ys: Any
+    t_end: Array
+    y_end: Array
+    stats: dict
+    result: RESULTS
+    closest: Array
+    interpolation: Any
+
+
+@eqx.filter_jit
+def _integrate(
     mechanism,
-    state,
+    accuracy,
+    outset,
+    formulation,
     t0,
     t1,
     dt0,
-    accuracy,
-    formulation,
     saveat,
     solver,
     controller,
@@ -192,19 +228,13 @@ def _simulate(
     event,
     progress_meter,
     max_steps,
-    dtype,
 ):
-    mechanism, state, t0, t1, dt0, accuracy, formulation, saveat, controller = _cast(
-        (mechanism, state, t0, t1, dt0, accuracy, formulation, saveat, controller), dtype
-    )
-    system = system_of(mechanism, dtype)
-    outset = depart(accuracy.method(dtype), system, t0, state)
-    method = accuracy.method(dtype, outset.rank) if formulation is None else formulation
-    problem = Problem(mechanism, system, method, accuracy, outset.sound)
+    dtype = outset.state.q.dtype
+    formulation, t0, t1, dt0, saveat, controller = _cast((formulation, t0, t1, dt0, saveat, controller), dtype)
+    problem = _problem(mechanism, accuracy, outset, formulation)
     if saveat is None:
         saveat = diffrax.SaveAt(ts=jnp.linspace(t0, t1, DEFAULT_SAVES, dtype=dtype))
-    plain = isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is _SAVE_STATE
-    subs = saveat.subs if plain else _wrapped_saves(saveat.subs)
+    subs = saveat.subs if _saves_states(saveat) else _wrapped_saves(saveat.subs)
     saveat = eqx.tree_at(
         lambda s: (s.subs, s.solver_state),
         saveat,
@@ -228,11 +258,21 @@ def _simulate(
         progress_meter=progress_meter,
     )
     (ts, t_end), (ys, y_end) = found.ts, found.ys
-    if plain:
-        times = jnp.concatenate([jnp.where(jnp.isfinite(ts), ts, t0), t_end])
-        states = jax.vmap(problem.close)(times, jnp.concatenate([ys, y_end]))
-        end, saved = State(states.q[-1], states.v[-1]), jnp.isfinite(ts)[:, None]
-        q, v, ys = jnp.where(saved, states.q[:-1], jnp.inf), jnp.where(saved, states.v[:-1], jnp.inf), None
+    result = _result(found.result, outset, controller.is_adaptive)
+    closest = found.solver_state[2]
+    return _Found(ts, ys, t_end, y_end, found.stats, result, closest, found.interpolation), formulation
+
+
+@eqx.filter_jit
+def _read(mechanism, accuracy, outset, formulation, t0, found, states) -> Solution:
+    """The solution, what is saved put on the loops."""
+    problem = _problem(mechanism, accuracy, outset, formulation)
+    ts, ys, t_end, y_end, stats, result, closest, interpolation = found
+    if states:
+        times = jnp.concatenate([jnp.where(jnp.isfinite(ts), ts, jnp.asarray(t0, ts.dtype)), t_end])
+        closed = jax.vmap(problem.close)(times, jnp.concatenate([ys, y_end]))
+        end, saved = State(closed.q[-1], closed.v[-1]), jnp.isfinite(ts)[:, None]
+        q, v, ys = jnp.where(saved, closed.q[:-1], jnp.inf), jnp.where(saved, closed.v[:-1], jnp.inf), None
     else:
         q, v, end = None, None, problem.close(t_end[0], y_end[0])
     return Solution(
@@ -245,11 +285,11 @@ def _simulate(
         ys=ys,
         t_end=t_end[0],
         end=end,
-        stats=found.stats,
-        result=_result(found.result, outset, controller.is_adaptive),
+        stats=stats,
+        result=result,
         rank_nearby=outset.rank,
-        closest=found.solver_state[2],
-        interpolation=found.interpolation,
+        closest=closest,
+        interpolation=interpolation,
     )
 
 
