@@ -1,5 +1,6 @@
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 # Tests spend their time on compiling, which these halve and more; they change how code is made, not what it computes.
@@ -7,13 +8,26 @@ os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true --xla_backend_optimization_level=0",
 )
+# What one test file has compiled, in this process or another, the next one reads. Errors of Equinox as numbers that are
+# not finite: a program with a callback in it cannot be kept.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _compiled = tempfile.TemporaryDirectory()  # removed with the process that made it, the others inherit its name
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": _compiled.name, "EQX_ON_ERROR": "nan"}
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+# Files that take longest begin first, so that at the end no process waits for another.
+LONGEST = ("test_notebooks", "test_gradients", "test_joints_in_motion", "test_singular_starts", "test_known_answers")
 MOST_MAPS = 40_000  # of the 65 530 that Linux gives a process; beyond them the compiler crashes
+
+
+def pytest_collection_modifyitems(items):
+    place = {name: index for index, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))
 
 
 @pytest.fixture(autouse=True)
