@@ -3,6 +3,7 @@
 import argparse
 import sys
 
+import linkax as lx
 from linkax.cli import compare, simulate
 from linkax.scenes import SCENES
 
@@ -22,6 +23,9 @@ def main(argv=None) -> int:
     except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
         sys.stderr.close()
         return 0
+    except lx.SimulationError as error:
+        print(f"linkax: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
     except (ValueError, OSError) as error:
         print(f"linkax: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

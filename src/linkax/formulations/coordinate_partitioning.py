@@ -15,7 +15,7 @@ class CoordinatePartitioning(AbstractCorrection):
     - `tolerance`: a pivot below that much of the first one is none; its row is left out.
     """
 
-    tolerance: np.ndarray = parameter(1e-8, "tolerance of CoordinatePartitioning")
+    tolerance: np.ndarray = parameter(1e-6, "tolerance of CoordinatePartitioning")
 
     def right_inverse(self, mass, jacobian):
         return by_partition(jacobian, self.tolerance)

@@ -33,7 +33,7 @@ class MoorePenrose(AbstractAcceleration):
     """
 
     inverse: Literal["svd", "gram-schmidt"] = eqx.field(static=True, default="svd")
-    tolerance: np.ndarray = parameter(1e-8, "tolerance of MoorePenrose")
+    tolerance: np.ndarray = parameter(1e-6, "tolerance of MoorePenrose")
 
     def __check_init__(self):
         if self.inverse not in INVERSES:
@@ -52,7 +52,7 @@ class MassOrthogonalProjection(AbstractCorrection):
     - `tolerance`: see `MoorePenrose`.
     """
 
-    tolerance: np.ndarray = parameter(1e-8, "tolerance of MassOrthogonalProjection")
+    tolerance: np.ndarray = parameter(1e-6, "tolerance of MassOrthogonalProjection")
 
     def right_inverse(self, mass, jacobian):
         return mass_orthogonal_inverse(mass, jacobian, by_svd, self.tolerance)

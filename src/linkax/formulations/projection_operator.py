@@ -15,7 +15,7 @@ class ProjectionOperator(AbstractAcceleration):
     - `tolerance`: singular values of J below that much of the largest one count as zero.
     """
 
-    tolerance: np.ndarray = parameter(1e-8, "tolerance of ProjectionOperator")
+    tolerance: np.ndarray = parameter(1e-6, "tolerance of ProjectionOperator")
 
     def __call__(self, mass, jacobian, force, gamma):
         back = by_svd(jacobian, self.tolerance)

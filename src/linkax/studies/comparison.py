@@ -1,6 +1,7 @@
 """Formulations side by side on one mechanism."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -10,6 +11,7 @@ import jax
 import numpy as np
 
 from linkax.equations.system import system_of
+from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import COMPARED
 from linkax.formulations.named import formulation as named
@@ -27,7 +29,7 @@ TIGHTEST, NEXT_TO_IT = 1e-13, 1e-12  # tolerances of the reference and of its ch
 DIVERGED = 1e-2  # of the mechanism's length
 OPEN = 1e-3  # violation of positions [rad, or lengths of the loop]
 INSTANT = 1e-6  # of the whole time
-REPEATS, LONG_RUN = 3, 0.5  # a run that takes longer [s] is timed once
+LONG_RUN = 0.5  # a run that takes longer [s] is timed once
 STOPPED = {
     "dt_min_reached": "the step size fell to nothing",
     "max_steps_reached": "out of steps",
@@ -41,7 +43,7 @@ class Trial(NamedTuple):
     - `rtol` of adaptive steps, or `step` of fixed ones [s]; the other is None.
     - `error`: largest distance of any point from the known answer, at all times reached [m].
     - `position_violation`, `velocity_violation`, `acceleration_violation`: see `Solution.worst_violation`.
-    - `energy_error`: largest difference from the reference run's energy, over its largest kinetic energy.
+    - `energy_error`: largest difference from the reference run's energy, over its largest kinetic energy [J if none].
     - `steps`, `evaluations`: of the solver, and of the equations of motion in them. `run_s`: wall time [s].
     - `reached` [s]. `verdict`: "converged", or "diverged": the run ended early, or its error is above the bound.
     - `why`: how it diverged, in words.
@@ -96,6 +98,7 @@ def compare(
     formulations: Mapping[str, AbstractFormulation | None] | Sequence[str] = COMPARED,
     exact: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None = None,
     bound: float | None = None,
+    repeats: int = 3,
     report: Callable[[str, float | None], None] = lambda phase, fraction: None,
 ) -> Comparison:
     """Integrate the same motion from 0 to t1 [s] by several formulations.
@@ -108,23 +111,26 @@ def compare(
     - `formulations`: names of `linkax.formulations.named`, or {name of one's own: formulation}.
     - `exact`: times -> positions of the points, (n_t, 3) each [m], where they are known in closed form.
     - `bound`: of the error [m]; default: a hundredth of the mechanism's length.
+    - `repeats`: of each run, of which the shortest counts.
     - `report`: called with what happens now, and with the fraction done where that is known.
 
     **Returns:** a `Comparison`, of trials in the order of formulations, for each of these of steppings.
+
+    **Raises:** `ValueError` for an unknown name; `SimulationError` where the paper's formulation cannot do the motion.
     """
     chosen = dict(formulations) if isinstance(formulations, Mapping) else {name: named(name) for name in formulations}
-    shared = iter(in_shared_programs([entry for entry in chosen.values() if entry is not None]))
-    chosen = {name: None if entry is None else next(shared) for name, entry in chosen.items()}
+    classical = {name: entry for name, entry in chosen.items() if isinstance(entry, ClassicalFormulation)}
+    chosen |= dict(zip(classical, in_shared_programs(list(classical.values())), strict=True))
     times = np.linspace(0.0, t1, DEFAULT_SAVES)
     positions = lambda found: {name: np.asarray(found.position(*point)) for name, point in points.items()}
 
-    def run(formulation, stepping, times=times):
-        return jax.block_until_ready(_run(mechanism, state, times, formulation, stepping))
+    def run(formulation, stepping, times=times, throw=False):
+        return jax.block_until_ready(_run(mechanism, state, times, formulation, stepping, throw))
 
     report("compiling the reference run", None)
-    reference = run(None, Stepping(diffrax.Dopri8(), rtol=TIGHTEST))
+    reference = run(None, Stepping(diffrax.Dopri8(), rtol=TIGHTEST), throw=True)
     answer = positions(reference) if exact is None else exact(times)
-    other = run(None, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT)) if exact is None else reference
+    other = run(None, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT), throw=True) if exact is None else reference
     bound = DIVERGED * float(system_of(mechanism, float).length) if bound is None else bound
     passages = [float(passage) for passage in reference.passages().times]
     trials = []
@@ -132,14 +138,14 @@ def compare(
         report(f"running {name}", count / len(chosen))
         for stepping in steppings:
             run(formulation, stepping, INSTANT * times)  # compiles, where no formulation before it has
-            found, seconds = _timed(lambda formulation=formulation, stepping=stepping: run(formulation, stepping))
+            found, seconds = _timed(functools.partial(run, formulation, stepping), repeats)
             apart = _apart(positions(_plain(found)), answer)
             trials.append(_trial(name, stepping, found, seconds, apart, bound, reference, passages, state))
     uncertainty = float(np.max(_apart(positions(other), answer)))
     return Comparison("reference run" if exact is None else "closed form", uncertainty, bound, passages, trials)
 
 
-def _run(mechanism, state, times, formulation, stepping) -> Solution:
+def _run(mechanism, state, times, formulation, stepping, throw) -> Solution:
     fixed, most = {}, DEFAULT_MAX_STEPS
     if stepping.step is not None:
         fixed = {"dt0": stepping.step, "stepsize_controller": diffrax.ConstantStepSize()}
@@ -153,15 +159,15 @@ def _run(mechanism, state, times, formulation, stepping) -> Solution:
         solver=stepping.solver,
         saveat=diffrax.SaveAt(ts=times),
         max_steps=most,
-        throw=False,
+        throw=throw,
         **fixed,
     )
 
 
-def _timed(run):
+def _timed(run, repeats):
     """What a run finds, and the shortest time that it takes [s]."""
     shortest = np.inf
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         began = time.perf_counter()
         found = run()
         shortest = min(shortest, time.perf_counter() - began)
@@ -185,6 +191,7 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
     finished = bool(found.result == RESULTS.successful)
     reached = np.isfinite(np.asarray(found.ts))
     energy = np.asarray(_plain(found).energy() - reference.energy())[reached]
+    kinetic = np.max(np.asarray(reference.kinetic_energy()))
     error = float(np.max(apart))
     verdict = "converged" if finished and error <= bound else "diverged"
     why = ""
@@ -208,7 +215,7 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
         position_violation=float(worst.position),
         velocity_violation=float(worst.velocity),
         acceleration_violation=float(worst.acceleration),
-        energy_error=float(np.max(np.abs(energy), initial=0.0) / np.max(np.asarray(reference.kinetic_energy()))),
+        energy_error=float(np.max(np.abs(energy), initial=0.0) / (kinetic if kinetic > 0.0 else 1.0)),
         steps=steps,
         evaluations=_evaluations(stepping.solver, steps),
         run_s=seconds,
