@@ -69,6 +69,11 @@ from linkax.simulation.assembly import assemble as assemble  # noqa: E402
 from linkax.simulation.instant import Violation as Violation  # noqa: E402
 from linkax.simulation.results import RESULTS as RESULTS  # noqa: E402
 from linkax.simulation.results import SimulationError as SimulationError  # noqa: E402
+from linkax.simulation.runge_kutta import RungeKutta4 as RungeKutta4  # noqa: E402
 from linkax.simulation.simulate import simulate as simulate  # noqa: E402
 from linkax.simulation.solution import Solution as Solution  # noqa: E402
 from linkax.simulation.state import State as State  # noqa: E402
+from linkax.studies.comparison import Comparison as Comparison  # noqa: E402
+from linkax.studies.comparison import Stepping as Stepping  # noqa: E402
+from linkax.studies.comparison import Trial as Trial  # noqa: E402
+from linkax.studies.comparison import compare as compare  # noqa: E402

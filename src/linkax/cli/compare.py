@@ -4,9 +4,8 @@ import json
 import math
 from pathlib import Path
 
-import linkax as lx
 from linkax.cli.options import Run, add_run_options, end_progress, one_of, positive, progress, steps_in_words
-from linkax.formulations.named import ADDITIONS, BASES, COMPARED, TANGENT_SPACE, formulation
+from linkax.formulations.named import BASES, COMPARED, TANGENT_SPACE, formulation
 from linkax.simulation.files import written_whole
 from linkax.studies.comparison import Comparison, Stepping, at_equal_cost, compare
 
@@ -22,7 +21,7 @@ def add_command(commands):
         "compare",
         help="integrate a scene by all formulations, and compare errors, violations and cost",
         epilog=f"A NAME is {TANGENT_SPACE} (the paper's), or one of {', '.join(BASES)}, with "
-        f"{', '.join(f'+{word}' for word in ADDITIONS)} added as one likes.",
+        "+baumgarte added, and +partitioning or +projection.",
     )
     parser.set_defaults(command=_compare)
     add_run_options(parser)
@@ -41,10 +40,7 @@ def _compare(arguments):
     names = {name.strip(): formulation(name.strip()) for name in arguments.formulations.split(",")}
     if arguments.equal == "cost":
         names = {TANGENT_SPACE: None} | names
-    mechanism = asked.mechanism
-    if arguments.all_rows:
-        parts = mechanism.bodies, mechanism.joints, mechanism.forces, mechanism.constraints
-        mechanism = lx.Mechanism(*parts, all_rows=True)
+    mechanism = asked.mechanism.with_all_rows() if arguments.all_rows else asked.mechanism
     out = Path("linkax-out") / f"compare-{asked.scene.name}" if arguments.out is None else arguments.out
     out.mkdir(parents=True, exist_ok=True)
     exact = asked.scene.exact
@@ -121,7 +117,7 @@ def _for_people(described, found, trials, files):
         rows.append(
             (
                 trial.formulation + size,
-                *(f"{number:.1e}" for number in (trial.error, *violations, trial.energy_error)),
+                *(f"{n:.1e}" if trial.reached > 0.0 else "-" for n in (trial.error, *violations, trial.energy_error)),
                 str(trial.steps),
                 str(trial.evaluations or ""),
                 f"{1e3 * trial.run_s:.1f}",

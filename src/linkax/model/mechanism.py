@@ -26,7 +26,7 @@ class Mechanism(eqx.Module):
     - `bodies`, `joints`, `forces`: sequences; names unique among bodies and among joints.
     - `constraints`: `Coupling`, `Drive` and `Distance`; names unique among joints and constraints.
     - `all_rows`: keep those loop rows too that no motion changes, such as the out-of-plane rows of a planar
-      loop. It changes no motion; classical formulations fail on such rows.
+      loop. It changes no motion; Lagrange multipliers fail on such rows.
 
     **Raises:** `ValueError` naming the element: a duplicate or unknown name, a body that no
     joint connects to ground, a joint with `cut=True` that closes no loop.
@@ -74,6 +74,10 @@ class Mechanism(eqx.Module):
             constraints=tuple(constraint.name for constraint in constraints),
             constraint_terms=tuple(constraint.terms for constraint in constraints),
         )
+
+    def with_all_rows(self) -> "Mechanism":
+        """The same mechanism with those loop rows too that no motion changes (see `all_rows`)."""
+        return Mechanism(self.bodies, self.joints, self.forces, self.constraints, all_rows=True)
 
     def body(self, name: str) -> RigidBody:
         """The body of that name."""

@@ -22,7 +22,7 @@ def plot_comparison(comparison: Comparison) -> Figure:
     bases = list(dict.fromkeys(name.split("+")[0] for name in names if name != TANGENT_SPACE))
     for name in names:
         base, *added = name.split("+")
-        own = [trial for trial in comparison.trials if trial.formulation == name]
+        own = [trial for trial in comparison.trials if trial.formulation == name and trial.reached > 0.0]
         ours = name == TANGENT_SPACE
         colour = BLUE if ours else COLOURS[bases.index(base) % len(COLOURS)]
         times, errors = [1e3 * trial.run_s for trial in own], [max(trial.error, SMALLEST) for trial in own]

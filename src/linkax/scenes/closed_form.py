@@ -3,21 +3,31 @@
 import numpy as np
 from scipy.special import ellipj, ellipkinc
 
-
-def direction(angle) -> np.ndarray:
-    """Unit vectors at angles from +x towards +y [rad], (n, 3)."""
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+SLOW = 1e-8  # of k² from one: so close to coming to rest upright, elliptic functions lose their digits
 
 
-def pendulum_angle(times, stiffness, angle, speed) -> np.ndarray:
-    """θ(t) of θ̈ = −ω² sin θ, by Jacobi's elliptic functions [rad].
+def turned_link(times, stiffness, angle, speed) -> np.ndarray | None:
+    """Unit vectors (n, 3) along a link that moves like a pendulum: α̈ = −ω² cos α, α from +x towards +y.
 
-    Whittaker, Analytical Dynamics of Particles and Rigid Bodies (4th ed.), section 44.
+    None where it comes too close to rest upright.
 
     **Arguments:**
 
-    - `times` [s], from the start; `stiffness`: ω² [1/s²], zero or more.
-    - `angle`, `speed`: θ and θ̇ at the start [rad, rad/s].
+    - `times` [s], from the start; `stiffness`: ω² [1/s²].
+    - `angle`, `speed`: α and α̇ at the start [rad, rad/s].
+    """
+    hanging = -np.pi / 2 if stiffness >= 0.0 else np.pi / 2
+    found = pendulum_angle(times, abs(stiffness), angle - hanging, speed)
+    if found is None:
+        return None
+    turn = found + hanging
+    return np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
+
+
+def pendulum_angle(times, stiffness, angle, speed) -> np.ndarray | None:
+    """θ(t) of θ̈ = −ω² sin θ, by Jacobi's elliptic functions [rad]; None where it comes too close to rest upright.
+
+    Whittaker, Analytical Dynamics of Particles and Rigid Bodies (4th ed.), section 44.
     """
     times = np.asarray(times, dtype=float)
     if stiffness == 0.0:
@@ -26,6 +36,8 @@ def pendulum_angle(times, stiffness, angle, speed) -> np.ndarray:
     half = angle / 2.0 - np.pi * turns
     # k² = E / (2 ω²), with the energy counted from the lowest position.
     square = np.sin(half) ** 2 + (speed / (2.0 * frequency)) ** 2
+    if abs(square - 1.0) < SLOW:
+        return None
     if square == 0.0:
         return np.full_like(times, angle)
     if square < 1.0:  # it swings: sin(θ/2) = k sn(ωt + u), cos(θ/2) = dn(ωt + u)

@@ -5,10 +5,8 @@ When all links lie in line the mechanism has N + 1 degrees of freedom for a mome
 
 import math
 
-import numpy as np
-
 import linkax as lx
-from linkax.scenes.closed_form import direction, pendulum_angle
+from linkax.scenes.closed_form import turned_link
 from linkax.scenes.scene import Scene, Variant
 
 
@@ -51,8 +49,8 @@ def _exact(parameters, times):
     count, length = parameters["N"], parameters["length"]
     weight, inertia = (count + 1) / 2 + count, (count + 1) / 3 + count
     stiffness = parameters["gravity"] / length * weight / inertia
-    angle = pendulum_angle(times, stiffness, parameters["angle"] + np.pi / 2, parameters["speed"]) - np.pi / 2
-    return {"B0": length * direction(angle)}
+    link = turned_link(times, stiffness, parameters["angle"], parameters["speed"])
+    return None if link is None else {"B0": length * link}
 
 
 N_FOUR_BAR = Scene(

@@ -1,9 +1,7 @@
 """Planar simple pendulum, problem A01 of the LIM/IFToMM benchmark library."""
 
-import numpy as np
-
 import linkax as lx
-from linkax.scenes.closed_form import direction, pendulum_angle
+from linkax.scenes.closed_form import turned_link
 from linkax.scenes.scene import Scene, Variant
 
 
@@ -22,9 +20,9 @@ def _initial(mechanism, parameters):
 
 
 def _exact(parameters, times):
-    length, angle = parameters["length"], parameters["angle"]
-    turn = pendulum_angle(times, parameters["gravity"] / length, angle + np.pi / 2, parameters["speed"]) - np.pi / 2
-    return {"bob": length * direction(turn)}
+    length = parameters["length"]
+    link = turned_link(times, parameters["gravity"] / length, parameters["angle"], parameters["speed"])
+    return None if link is None else {"bob": length * link}
 
 
 PENDULUM = Scene(

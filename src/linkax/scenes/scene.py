@@ -40,7 +40,8 @@ class Scene:
     - `mechanism`: parameters -> `Mechanism`, a pure function; all but counts may be traced.
     - `initial`: (mechanism, parameters) -> `State`.
     - `points`: parameters -> {name: (body, frame of the body or None for its centre of mass)}.
-    - `exact`: (parameters, times [s]) -> {name of a point: positions (n_t, 3) [m]}, in closed form, or None.
+    - `exact`: (parameters, times [s]) -> {name of a point: positions (n_t, 3) [m]}, in closed form, or None where
+      there is none for these parameters; or None.
 
     ```python
     parameters = scene.settings("SC2", {"speed": 3.0})
@@ -59,7 +60,7 @@ class Scene:
     mechanism: Callable[[Parameters], Mechanism]
     initial: Callable[[Mechanism, Parameters], State]
     points: Callable[[Parameters], dict[str, tuple[str, str | None]]]
-    exact: Callable[[Parameters, np.ndarray], dict[str, np.ndarray]] | None = None
+    exact: Callable[[Parameters, np.ndarray], dict[str, np.ndarray] | None] | None = None
 
     def variant(self, name: str | None = None) -> Variant:
         """The variant of that name, or the default one.

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 import linkax as lx
-from linkax.scenes.closed_form import direction, pendulum_angle
+from linkax.scenes.closed_form import turned_link
 from linkax.scenes.scene import Scene, Variant
 
 
@@ -39,8 +39,8 @@ def _exact(parameters, times):
     """The coupler only translates, so that the rhombus moves like a pendulum: 5/3 m l² α̈ = −2 m g l cos α."""
     length = parameters["length"]
     stiffness = 1.2 * parameters["gravity"] / length
-    angle = pendulum_angle(times, stiffness, parameters["angle"] + np.pi / 2, parameters["speed"]) - np.pi / 2
-    return {"C": length * (np.array([1.0, 0.0, 0.0]) + direction(angle))}
+    link = turned_link(times, stiffness, parameters["angle"], parameters["speed"])
+    return None if link is None else {"C": length * (link + np.array([1.0, 0.0, 0.0]))}
 
 
 SPATIAL_FOUR_LINK = Scene(

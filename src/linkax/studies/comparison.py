@@ -109,7 +109,7 @@ def compare(
     - `points`: {name: (body, frame of the body or None for its centre of mass)}, whose positions are compared.
     - `steppings`: how to step; every formulation is run with each of them.
     - `formulations`: names of `linkax.formulations.named`, or {name of one's own: formulation}.
-    - `exact`: times -> positions of the points, (n_t, 3) each [m], where they are known in closed form.
+    - `exact`: times -> positions of the points, (n_t, 3) each [m], or None, where they are known in closed form.
     - `bound`: of the error [m]; default: a hundredth of the mechanism's length.
     - `repeats`: of each run, of which the shortest counts.
     - `report`: called with what happens now, and with the fraction done where that is known.
@@ -125,12 +125,14 @@ def compare(
     positions = lambda found: {name: np.asarray(found.position(*point)) for name, point in points.items()}
 
     def run(formulation, stepping, times=times, throw=False):
-        return jax.block_until_ready(_run(mechanism, state, times, formulation, stepping, throw))
+        most = DEFAULT_MAX_STEPS if stepping.step is None else max(DEFAULT_MAX_STEPS, int(2.0 * t1 / stepping.step))
+        return jax.block_until_ready(_run(mechanism, state, times, formulation, stepping, most, throw))
 
     report("compiling the reference run", None)
     reference = run(None, Stepping(diffrax.Dopri8(), rtol=TIGHTEST), throw=True)
-    answer = positions(reference) if exact is None else exact(times)
-    other = run(None, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT), throw=True) if exact is None else reference
+    known = None if exact is None else exact(times)
+    answer = positions(reference) if known is None else known
+    other = run(None, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT), throw=True) if known is None else reference
     bound = DIVERGED * float(system_of(mechanism, float).length) if bound is None else bound
     passages = [float(passage) for passage in reference.passages().times]
     trials = []
@@ -139,17 +141,16 @@ def compare(
         for stepping in steppings:
             run(formulation, stepping, INSTANT * times)  # compiles, where no formulation before it has
             found, seconds = _timed(functools.partial(run, formulation, stepping), repeats)
-            apart = _apart(positions(_plain(found)), answer)
+            apart = np.where(np.isfinite(found.ts), _apart(positions(_plain(found)), answer), 0.0)
             trials.append(_trial(name, stepping, found, seconds, apart, bound, reference, passages, state))
     uncertainty = float(np.max(_apart(positions(other), answer)))
-    return Comparison("reference run" if exact is None else "closed form", uncertainty, bound, passages, trials)
+    return Comparison("reference run" if known is None else "closed form", uncertainty, bound, passages, trials)
 
 
-def _run(mechanism, state, times, formulation, stepping, throw) -> Solution:
-    fixed, most = {}, DEFAULT_MAX_STEPS
+def _run(mechanism, state, times, formulation, stepping, most, throw) -> Solution:
+    fixed = {}
     if stepping.step is not None:
         fixed = {"dt0": stepping.step, "stepsize_controller": diffrax.ConstantStepSize()}
-        most = max(DEFAULT_MAX_STEPS, int(2.0 * times[-1] / stepping.step))
     return simulate(
         mechanism,
         state,
@@ -182,9 +183,11 @@ def _plain(found) -> Solution:
 
 
 def _apart(positions, answer):
-    """Largest distance of any point at each time [m], zero where the run did not come."""
-    distances = [np.linalg.norm(positions[name] - answer[name], axis=-1) for name in answer if name in positions]
-    return np.nan_to_num(np.max(distances, axis=0), nan=0.0)
+    """Largest distance of any point at each time [m], infinite where a number is not finite."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        distances = [np.linalg.norm(positions[name] - answer[name], axis=-1) for name in answer if name in positions]
+    largest = np.max(distances, axis=0)
+    return np.where(np.isfinite(largest), largest, np.inf)
 
 
 def _trial(name, stepping, found, seconds, apart, bound, reference, passages, state) -> Trial:
@@ -217,7 +220,7 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
         acceleration_violation=float(worst.acceleration),
         energy_error=float(np.max(np.abs(energy), initial=0.0) / (kinetic if kinetic > 0.0 else 1.0)),
         steps=steps,
-        evaluations=_evaluations(stepping.solver, steps),
+        evaluations=_evaluations(stepping.solver, steps, getattr(found.formulation, "moves_after_steps", False)),
         run_s=seconds,
         reached=float(found.t_end),
         verdict=verdict,
@@ -225,16 +228,17 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
     )
 
 
-def _evaluations(solver, steps) -> int | None:
-    """Evaluations of the equations of motion in so many steps of a Runge-Kutta method."""
+def _evaluations(solver, steps, anew) -> int | None:
+    """Evaluations of the equations of motion in so many Runge-Kutta steps; `anew`: that at the start of each too."""
     tableau = getattr(solver, "tableau", None)
     if tableau is None:
         return None
-    return steps * (tableau.num_stages - tableau.fsal) + int(tableau.fsal)
+    reused = tableau.fsal and not anew
+    return steps * (tableau.num_stages - reused) + int(reused)
 
 
 def at_equal_cost(trials: Sequence[Trial], budget_s: float) -> list[Trial]:
-    """Of each formulation the trial of the smallest error among those that took no longer than `budget_s` [s].
+    """Of each formulation the trial of the smallest error among those that converged within `budget_s` [s].
 
     Where none did, the fastest one.
     """
