@@ -77,7 +77,37 @@ def test_names_combine():
     assert dataclasses.replace(found, correction=None).correction is None
 
 
-BAD = ("lm", "lagrange-multipliers+magic", "tangent-space+baumgarte", "udwadia-kalaba+partitioning+projection", "")
+def test_in_single_precision_rounding_is_no_independent_row():
+    gamma = REDUNDANT @ jnp.arange(6.0)
+    expected = exact(REDUNDANT, gamma)[0]
+    for name in ("udwadia-kalaba", "moore-penrose-svd", "moore-penrose-gram-schmidt", "projection-operator"):
+        single = [jnp.asarray(part, jnp.float32) for part in (MASS, REDUNDANT, FORCE, gamma)]
+        acceleration, _ = eqx.filter_jit(BASES[name].acceleration)(*single)
+        np.testing.assert_allclose(acceleration, expected, rtol=1e-2, atol=1e-2)
+
+
+def test_mass_may_be_singular_where_the_rows_hold_it():
+    mass, jacobian = jnp.diag(jnp.array([1.0, 2.0, 0.0])), jnp.array([[0.0, 1.0, 1.0]])
+    for name in ("augmented-lagrangian", "lagrange-multipliers-block"):
+        acceleration, _ = BASES[name].acceleration(mass, jacobian, jnp.array([1.0, 1.0, 0.5]), jnp.array([0.3]))
+        np.testing.assert_allclose(acceleration, [1.0, 0.25, 0.05], atol=1e-6)
+
+
+def test_parts_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match=r"acceleration of ClassicalFormulation is 'lagrange', which is none"):
+        lx.ClassicalFormulation("lagrange")
+    with pytest.raises(ValueError, match=r"sweeps of AugmentedLagrangian is 0; it must be an integer of at least 1"):
+        lx.AugmentedLagrangian(sweeps=0)
+
+
+BAD = (
+    "augmented-lagrangian+baumgarte",
+    "lm",
+    "lagrange-multipliers+magic",
+    "tangent-space+baumgarte",
+    "udwadia-kalaba+partitioning+projection",
+    "",
+)
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -67,7 +67,7 @@ def test_order(name, scene):
 def _first_second(variant, chosen, all_rows=False):
     mechanism, state = start("crank-slider", variant)
     if all_rows:
-        mechanism = lx.Mechanism(mechanism.bodies, mechanism.joints, mechanism.forces, all_rows=True)
+        mechanism = mechanism.with_all_rows()
     saveat = diffrax.SaveAt(ts=np.linspace(0.0, 0.8, 21))
     return lx.simulate(mechanism, state, t1=0.8, dt0=0.02, saveat=saveat, formulation=chosen, **FIXED)
 

@@ -16,16 +16,22 @@ class AugmentedLagrangian(AbstractAcceleration):
     Serna, Computer Methods in Applied Mechanics and Engineering 71, 1988; who stabilise as Baumgarte does, with
     α = μΩ, β = Ω, most often Ω = 10 1/s and μ = 1. Rows may be redundant.
 
-    - `penalty`: S over the largest diagonal entry of M.
-    - `sweeps`: how often.
+    - `penalty`: S over the largest diagonal entry of M; its rounding needs double precision.
+    - `sweeps`: how often, one or more; one is the penalty method.
     """
 
     penalty: np.ndarray = parameter(1e7, "penalty of AugmentedLagrangian")
     sweeps: int = eqx.field(static=True, default=10)
 
+    def __check_init__(self):
+        if not (isinstance(self.sweeps, int) and self.sweeps >= 1):
+            raise ValueError(f"sweeps of AugmentedLagrangian is {self.sweeps!r}; it must be an integer of at least 1")
+
     def __call__(self, mass, jacobian, force, gamma):
         size = self.penalty * jnp.max(jnp.diagonal(mass))
         factor = cho_factor(mass + size * jacobian.T @ jacobian)
+        # The first sweep needs M v̇₀ alone, so M may be singular.
+        first = cho_solve(factor, force + size * jacobian.T @ gamma)
 
         def sweep(_, carry):
             # The equation above less (M + JᵀSJ) v̇ₖ, so that rounding falls with what is left open.
@@ -33,5 +39,4 @@ class AugmentedLagrangian(AbstractAcceleration):
             acceleration = acceleration - cho_solve(factor, size * jacobian.T @ (jacobian @ acceleration - gamma))
             return acceleration, multipliers - size * (jacobian @ acceleration - gamma)
 
-        start = cho_solve(cho_factor(mass), force), jnp.zeros_like(gamma)
-        return lax.fori_loop(0, self.sweeps, sweep, start)
+        return lax.fori_loop(1, self.sweeps, sweep, (first, -size * (jacobian @ first - gamma)))

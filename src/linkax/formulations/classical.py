@@ -82,10 +82,25 @@ class ClassicalFormulation(AbstractFormulation):
     correction: AbstractCorrection | None = None
     sweeps: int = eqx.field(static=True, default=3)
 
+    def __check_init__(self):
+        for what, kind in (
+            ("acceleration", AbstractAcceleration),
+            ("stabilisation", Baumgarte),
+            ("correction", AbstractCorrection | None),
+        ):
+            if not isinstance(getattr(self, what), kind):
+                raise ValueError(f"{what} of ClassicalFormulation is {getattr(self, what)!r}, which is none")
+        if not (isinstance(self.sweeps, int) and self.sweeps >= 1):
+            raise ValueError(f"sweeps of ClassicalFormulation is {self.sweeps!r}; it must be an integer of at least 1")
+
     @property
     def nearest(self):
         """Distances are not measured, and count as one."""
         return 1.0
+
+    @property
+    def moves_after_steps(self) -> bool:
+        return self.correction is not None
 
     def _solved(self, at: Coefficients, v) -> Dynamics:
         """v̇ and λ, and what v̇ violates of the rows without stabilisation."""
@@ -124,7 +139,8 @@ class ClassicalFormulation(AbstractFormulation):
 
         q = lax.fori_loop(0, self.sweeps, closer, q)
         at, back = inverse(q)
-        return q, v - back @ (at.jacobian @ v - rate(system, t)), errors, one
+        remaining = tuple(error - back @ (at.jacobian @ error) for error in errors)
+        return q, v - back @ (at.jacobian @ v - rate(system, t)), remaining, one
 
     def close(self, system: System, t, q, v):
         q, v, _, _ = self.correct(system, t, q, v)

@@ -9,8 +9,8 @@ from linkax.linalg.right_inverse import by_partition
 class CoordinatePartitioning(AbstractCorrection):
     """Dependent coordinates and speeds follow the independent ones.
 
-    Which are which, elimination with complete pivoting decides, anew in each correction. Wehage and Haug,
-    Journal of Mechanical Design 104, 1982.
+    Which are which, elimination with complete pivoting decides, anew at each state that is corrected. After Wehage
+    and Haug, Journal of Mechanical Design 104, 1982, who keep a choice as long as it is well conditioned.
 
     - `tolerance`: a pivot below that much of the first one is none; its row is left out.
     """

@@ -48,6 +48,11 @@ class AbstractFormulation(eqx.Module):
     def nearest(self):
         """The distance from a singular configuration below which rounding grows no more."""
 
+    @property
+    @abc.abstractmethod
+    def moves_after_steps(self) -> bool:
+        """Whether `correct` moves states to where the derivative is another one than before."""
+
     @abc.abstractmethod
     def derivative(self, system: System, t, q, v, correct: bool):
         """v, v̇, the coordinates that they hold at, and the distance d from the nearest singular configuration.

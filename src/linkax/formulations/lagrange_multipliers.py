@@ -8,12 +8,12 @@ from linkax.formulations.classical import AbstractAcceleration
 
 
 class LagrangeMultipliers(AbstractAcceleration):
-    """Accelerations and multipliers of the constrained equations, by LU; fails where J loses rank.
+    """Accelerations and multipliers of the constrained equations, by LU; fails where rows depend on one another.
 
     García de Jalón and Bayo, Kinematic and Dynamic Simulation of Multibody Systems, 1994, ch. 5.
 
     - `block`: solve [[M, −Jᵀ], [J, 0]] at once; else (default) first (J M⁻¹ Jᵀ) λ = γ − J M⁻¹ f
-      for the multipliers.
+      for the multipliers, which needs a positive definite M.
     """
 
     block: bool = eqx.field(static=True, default=False)

@@ -24,7 +24,8 @@ class MoorePenrose(AbstractAcceleration):
     """The free acceleration and the smallest one, in the mass metric, that satisfies the rows.
 
     v̇ = a + M^(-1/2) B⁺ (γ − J a), a = M⁻¹ f, B = J M^(-1/2): Udwadia and Kalaba, Proceedings of the Royal
-    Society A 439, 1992. Rows may be redundant; multipliers are of minimum norm.
+    Society A 439, 1992. Rows may be redundant, M must be positive definite. By "svd", multipliers are of
+    minimum norm.
 
     - `inverse`: B⁺ by "svd", or by "gram-schmidt" on the rows of B, as in Neto and Ambrósio, Multibody System
       Dynamics 10, 2003.

@@ -11,7 +11,6 @@ from linkax.formulations.moore_penrose import MassOrthogonalProjection, MoorePen
 from linkax.formulations.projection_operator import ProjectionOperator
 
 TANGENT_SPACE = "tangent-space"
-ROUNDING = 1e-14  # a cut-off that only rounding falls below
 
 BASES = {
     "lagrange-multipliers": ClassicalFormulation(LagrangeMultipliers()),
@@ -19,7 +18,7 @@ BASES = {
     "augmented-lagrangian": ClassicalFormulation(AugmentedLagrangian(), Baumgarte(10.0, 10.0)),
     "moore-penrose-svd": ClassicalFormulation(MoorePenrose("svd")),
     "moore-penrose-gram-schmidt": ClassicalFormulation(MoorePenrose("gram-schmidt")),
-    "udwadia-kalaba": ClassicalFormulation(MoorePenrose("svd", ROUNDING)),
+    "udwadia-kalaba": ClassicalFormulation(MoorePenrose("svd", 0.0)),  # the same, cut off at rounding
     "projection-operator": ClassicalFormulation(ProjectionOperator()),
 }
 ADDITIONS = {
@@ -30,7 +29,7 @@ ADDITIONS = {
 
 
 def formulation(name: str) -> AbstractFormulation | None:
-    """The formulation of that name: one of `BASES`, then "+baumgarte", "+partitioning" or "+projection" as one likes.
+    """The formulation of that name: one of `BASES`, then "+baumgarte", and "+partitioning" or "+projection".
 
     None for "tangent-space", the paper's method, whose numbers are those of `linkax.Accuracy`.
 
@@ -40,10 +39,11 @@ def formulation(name: str) -> AbstractFormulation | None:
     if name == TANGENT_SPACE:
         return None
     added = {ADDITIONS[word][0]: ADDITIONS[word][1] for word in additions if word in ADDITIONS}
-    if base not in BASES or len(added) < len(additions):
+    twice = base == "augmented-lagrangian" and "baumgarte" in additions
+    if base not in BASES or len(added) < len(additions) or twice:
         raise ValueError(
             f"unknown formulation {name!r}; known: {TANGENT_SPACE}, or one of {', '.join(BASES)}, "
-            "to which may be added +baumgarte, and +partitioning or +projection"
+            "to which may be added +baumgarte (the augmented one has it), and +partitioning or +projection"
         )
     return dataclasses.replace(BASES[base], **added)
 

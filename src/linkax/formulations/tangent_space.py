@@ -64,6 +64,11 @@ class TangentSpace(AbstractFormulation):
         """Below the rank tolerance rows count as dependent."""
         return self.rank_tolerance
 
+    @property
+    def moves_after_steps(self) -> bool:
+        """No: derivatives are those of the corrected state."""
+        return False
+
     def _weight(self, instant: Coefficients):
         """W of the corrections."""
         if self.metric == "mass":

@@ -1,6 +1,6 @@
 """Right inverses G of a matrix A of any rank: A G r = r for every r in the range of A.
 
-A row counts as dependent, or a singular value as zero, below a fixed cut-off.
+A row counts as dependent, or a singular value as zero, below a fixed cut-off, and always below rounding.
 """
 
 import jax.numpy as jnp
@@ -9,11 +9,17 @@ from jaxtyping import Array, Float
 
 from linkax.linalg.row_echelon import row_echelon
 
+ROUNDING_ULPS = 10.0
+
+
+def _cut_off(matrix, tolerance):
+    return jnp.maximum(tolerance, ROUNDING_ULPS * max(matrix.shape) * jnp.finfo(matrix.dtype).eps)
+
 
 def by_svd(matrix: Float[Array, "m n"], tolerance) -> Float[Array, "n m"]:
     """The Moore-Penrose inverse by singular values, without those below `tolerance` times the largest."""
     left, sizes, right = jnp.linalg.svd(matrix, full_matrices=False)
-    kept = sizes > tolerance * sizes[0]
+    kept = sizes > _cut_off(matrix, tolerance) * sizes[0]
     inverse = jnp.where(kept, 1.0 / jnp.where(kept, sizes, 1.0), 0.0)
     return (right.T * inverse) @ left.T
 
@@ -33,7 +39,7 @@ def by_gram_schmidt(matrix: Float[Array, "m n"], tolerance) -> Float[Array, "n m
             along = basis @ row
             row, combination = row - along @ basis, combination - along @ transform
         remains = jnp.linalg.norm(row)
-        kept = remains > tolerance * jnp.linalg.norm(matrix[place])
+        kept = remains > _cut_off(matrix, tolerance) * jnp.linalg.norm(matrix[place])
         scale = jnp.where(kept, 1.0 / jnp.where(kept, remains, 1.0), 0.0)
         return basis.at[place].set(scale * row), transform.at[place].set(scale * combination)
 
@@ -47,7 +53,7 @@ def by_partition(matrix: Float[Array, "m n"], tolerance) -> Float[Array, "n m"]:
 
     Which ones complete pivoting chooses: those that the rows decide best.
     """
-    found = row_echelon(matrix, tolerance)
+    found = row_echelon(matrix, _cut_off(matrix, tolerance))
     is_pivot = jnp.arange(len(found.pivot_rows)) < found.rank
     decided = jnp.where(is_pivot[:, None], found.transform[found.pivot_rows], 0.0)
     return jnp.zeros(matrix.T.shape, matrix.dtype).at[found.pivot_columns].set(decided, unique_indices=True)

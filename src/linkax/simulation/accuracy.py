@@ -22,7 +22,7 @@ class Accuracy(eqx.Module):
       and the floor of the tolerance for speeds. Default: `rtol`.
     - `projection`: where the state is put back on the closed loops: in every evaluation of the
       equations of motion ("stage"), after every accepted step ("step"), "both" (default), or
-      "none". Saved states are corrected always.
+      "none". Saved states are corrected always. (For a classical formulation see there.)
     - `rank_tolerance`: τ; a loop row counts as independent where |R_kk| > τ max(|R₁₁|, 1).
       Default: 1e-6 in double, 1e-5 in single precision.
     - `clearance`: distance d from a singular configuration that the stages of adaptive steps keep

@@ -11,6 +11,7 @@ from linkax.equations.loops import gaps, jacobian, residual
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
+from linkax.formulations.classical import ClassicalFormulation
 from linkax.linalg.constrained_solve import invert
 from linkax.model.constraints import Drive
 from linkax.simulation.outset import MOVES, moving_joints
@@ -37,9 +38,7 @@ def cause(solution, state) -> str:
     if (result == RESULTS.no_branch) | (result == RESULTS.not_unique):
         basis = Crossing.at(system, t, state.q, method.rank_tolerance).inverse.basis
         return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
-    if solution.formulation is not None and (found := _dependent_rows(solution, system, method, t)):
-        return found
-    return _drives(solution, system, t) or _ahead(solution, system, t)
+    return _no_acceleration(solution, system, method, t) or _drives(solution, system, t) or _ahead(solution, system, t)
 
 
 def _listed(names):
@@ -73,17 +72,18 @@ def _ahead(solution, system, t):
     return ""
 
 
-def _dependent_rows(solution, system, method, t):
+def _no_acceleration(solution, system, method, t):
     """A classical formulation that finds no acceleration where the run ends."""
+    if not isinstance(solution.formulation, ClassicalFormulation):
+        return ""
     end = solution.end
     acceleration = solution.formulation.dynamics(system, t, end.q, end.v).acceleration
     if np.all(np.isfinite(acceleration)):
         return ""
     rank, rows = int(np.sum(method.crossing(system, t, end.q).inverse.rank)), system.topology.num_rows
-    return (
-        f" The formulation finds no finite acceleration there: {rank} of the {rows} loop rows are independent. "
-        "The default formulation needs no independent rows."
-    )
+    mass = "the mass matrix of the tree is singular"
+    why = f"{rank} of the {rows} loop rows are independent" if rank < rows else mass
+    return f" The formulation finds no finite acceleration there: {why}. The default formulation needs neither."
 
 
 def _drives(solution, system, t):

@@ -166,6 +166,8 @@ class Projected(diffrax.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         inner, leaves, closest = solver_state
+        # Solvers that begin with the last derivative of the step before must not where the state has moved since.
+        made_jump = True if self.after_step and args.method.moves_after_steps else made_jump
         y1, error, dense_info, inner, result = self.solver.step(terms, t0, t1, y0, args, inner, made_jump)
         stages = self._stages(dense_info, t1 - t0)
         if self.after_step:

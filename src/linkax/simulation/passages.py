@@ -11,6 +11,7 @@ from diffrax import ThirdOrderHermitePolynomialInterpolation
 
 from linkax.equations.coordinates import on_manifold, rates
 from linkax.equations.system import system_of
+from linkax.formulations.classical import ClassicalFormulation
 
 REFINEMENTS = 4
 VANISHED = 0.1  # of the distances before and after: what a passage falls below
@@ -52,7 +53,7 @@ def passages(solution) -> Passages:
     times = np.sort((ts[intervals] + places * (ts[intervals + 1] - ts[intervals]))[vanished])
     spacing = np.max(np.diff(ts[: len(reached) + 1]), initial=0.0)
     times = times[np.diff(times, prepend=-np.inf) > TOGETHER * spacing]
-    if solution.formulation is not None:  # which does not measure how close its stages come
+    if isinstance(solution.formulation, ClassicalFormulation):  # which does not measure how close its stages come
         return Passages(times, math.nan)
     lost = np.log10(max(len(times), 1) / max(float(solution.closest), np.finfo(float).eps))
     return Passages(times, float(max(lost, 0.0)))

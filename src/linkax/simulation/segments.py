@@ -73,6 +73,7 @@ def simulate_in_segments(
             dt0=step,
             stepsize_controller=None if step is None else diffrax.ConstantStepSize(),
             saveat=diffrax.SaveAt(ts=times),
+            max_steps=DEFAULT_MAX_STEPS if step is None else max(DEFAULT_MAX_STEPS, int(2.0 * t1 / step)),
             throw=False,
         )
         return jax.block_until_ready(found), time.perf_counter() - began
@@ -81,7 +82,8 @@ def simulate_in_segments(
     _, compile_s = run(state, 0.0, INSTANT * t1)
     report("integrating", 0.0)
     first, run_s = run(state, 0.0, t1 / SEGMENTS)
-    if not _is_long(first, run_s):
+    # A classical formulation keeps what it leaves open: a segment would begin on the loops again.
+    if formulation is not None or not _is_long(first, run_s):
         whole, run_s = run(state, 0.0, t1)
         return TimedRun(whole, compile_s, run_s)
     parts, borders = [first], np.linspace(0.0, t1, SEGMENTS + 1)

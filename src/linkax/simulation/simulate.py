@@ -12,6 +12,7 @@ from jaxtyping import Array
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import formulation as named_formulation
+from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.accuracy import BALANCED, Accuracy
@@ -58,7 +59,8 @@ def simulate(
       classical ones it is compared with, by name ("lagrange-multipliers+baumgarte") or as a
       `linkax.ClassicalFormulation`; states are saved as it leaves them, on loops that drift open.
     - `saveat`: as in diffrax; default 201 times, evenly from t0 to t1. What is saved lies on the
-      closed loops. A `fn` of its own gets (t, state, mechanism), the `State` closed.
+      closed loops, as does the `State` that a `fn` of its own gets by (t, state, mechanism), but for
+      classical formulations without a correction.
     - `solver`: a diffrax solver, default `Dopri8`.
     - `stepsize_controller`: replaces rtol and atol of `accuracy`. It sees coordinates in radians
       and lengths of the mechanism, each of magnitude one, and speeds relative to the largest.
@@ -190,7 +192,9 @@ def _start(mechanism, state, t0, accuracy, dtype):
 
 def _problem(mechanism, accuracy, outset, formulation) -> Problem:
     dtype = outset.state.q.dtype
-    method = accuracy.method(dtype, outset.rank) if formulation is None else formulation
+    method = accuracy.method(dtype) if formulation is None else formulation
+    if isinstance(method, TangentSpace):
+        method = eqx.tree_at(lambda m: m.rank_nearby, method, outset.rank, is_leaf=lambda leaf: leaf is None)
     return Problem(mechanism, system_of(mechanism, dtype), method, accuracy, outset.sound)
 
 

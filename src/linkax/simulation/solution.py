@@ -32,7 +32,8 @@ class Solution(eqx.Module):
     - `result`: a `linkax.RESULTS`; equal to `RESULTS.successful` where all went well.
     - `rank_nearby`: rank along the motion, of each part that moves independently of the others, (k,);
       in a singular configuration `rank` is smaller than their sum.
-    - `closest`: smallest distance from a singular configuration at any stage of any step.
+    - `closest`: smallest distance from a singular configuration at any stage of any step; one where
+      the formulation does not measure it.
 
     All that is read by the methods below comes as arrays with times as the first axis, in ground
     axes and SI units. A solution from `jax.vmap` has the batch axes before that.
