@@ -28,10 +28,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from known_answers import reference, start
 from parts import print_parts
 
-from linkax.formulations.named import formulation
 from linkax.plotting import plot_point_motion, plot_reaction
 from linkax.plotting.colours import BLUE, GREEN, VERMILION
 from linkax.scenes import SCENES
+from linkax.simulation.simulate import fixed_steps
 from linkax.studies.comparison import Stepping, compare
 
 COLOURS = (BLUE, VERMILION, GREEN)
@@ -181,9 +181,7 @@ def four_link(out):
         mechanism, state = start("spatial-four-link", variant)
         for label, stepping in STEPPINGS.items():
             options = {"accuracy": lx.Accuracy(rtol=stepping.rtol or 1e-8), "solver": stepping.solver}
-            if stepping.step is not None:
-                options |= {"dt0": stepping.step, "stepsize_controller": diffrax.ConstantStepSize()}
-            found = lx.simulate(mechanism, state, t1=20.0, max_steps=50_000, **options)
+            found = lx.simulate(mechanism, state, t1=20.0, **options, **fixed_steps(stepping.step, 20.0))
             apart = np.asarray(found.position("coupler", at="tip")) - scene.exact(settings, np.asarray(found.ts))["C"]
             if (variant, label) == ("FL1", "RK4, 10 ms"):
                 _save(_figure_of_the_point(found, apart), out / "figures-14-15.png")
@@ -195,7 +193,7 @@ def four_link(out):
                     np.max(np.abs(np.gradient(found.joint_speed("A"), found.ts)))
                 ),
             }
-    _save(_figure_of_positions(mechanism, found), out / "figure-13.png")
+    _save(_figure_of_positions(mechanism), out / "figure-13.png")
 
 
 def _figure_of_the_point(found, apart):
@@ -215,7 +213,7 @@ def _figure_of_the_point(found, apart):
     return figure
 
 
-def _figure_of_positions(mechanism, found):
+def _figure_of_positions(mechanism):
     """The links where they lie in line, and a little before, moved apart so that all are seen."""
     figure = Figure(figsize=(7.0, 3.4), layout="constrained")
     for panel, angle, name in zip(figure.subplots(1, 2), (0.0, np.pi), ("α₁ = 0", "α₁ = π"), strict=True):
@@ -242,7 +240,7 @@ def _turned(mechanism, angle):
 
 
 def _verdicts(formulations, all_rows=True):
-    """Error or time of failure of each formulation: {label: {(start, steps): (verdict, text, why)}}."""
+    """Error or time of failure of each formulation: {label: {(start, steps): (verdict, text)}}."""
     scene, found = SCENES["spatial-four-link"], {}
     for variant in STARTS:
         settings = scene.settings(variant)
@@ -261,7 +259,7 @@ def _verdicts(formulations, all_rows=True):
         ).trials
         for trial, steps in zip(trials, list(STEPPINGS) * len(formulations), strict=True):
             text = f"{trial.error:.0e}" if trial.verdict == "converged" else _when(trial.why)
-            found.setdefault(trial.formulation, {})[variant, steps] = trial.verdict, text, trial.why
+            found.setdefault(trial.formulation, {})[variant, steps] = trial.verdict, text
     return found
 
 
@@ -271,7 +269,7 @@ def _when(why):
 
 
 def table_5(out):
-    found = _verdicts({name: None if name == "tangent-space" else formulation(name) for name in TABLE_5})
+    found = _verdicts(tuple(TABLE_5))
     for name, (label, *paper) in TABLE_5.items():
         yield {"method": label, "paper": ", ".join(paper)} | _by_start(found[name], paper)
 
@@ -279,14 +277,14 @@ def table_5(out):
 def table_5_differences(out):
     for label, runs in _verdicts(VARIED).items():
         yield {"method": label} | _by_start(runs)
-    for name, runs in _verdicts({name: formulation(name) for name in FEW_ROWS}, all_rows=False).items():
+    for name, runs in _verdicts(FEW_ROWS, all_rows=False).items():
         yield {"method": f"{TABLE_5[name][0]}, without redundant rows"} | _by_start(runs)
 
 
 def _by_start(runs, paper=None):
     """A column for each start, with all steps in it, and marks where a verdict is not the paper's."""
     columns = {}
-    for (variant, _), (verdict, text, _) in runs.items():
+    for (variant, _), (verdict, text) in runs.items():
         place, described = STARTS[variant]
         differs = paper is not None and not verdict.startswith(paper[place - 1])
         columns.setdefault(f"{variant} ({described})", []).append(text + " ≠" * differs)

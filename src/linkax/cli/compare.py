@@ -7,11 +7,10 @@ from pathlib import Path
 from linkax.cli.options import Run, add_run_options, end_progress, one_of, positive, progress, steps_in_words
 from linkax.formulations.named import BASES, COMPARED, TANGENT_SPACE, formulation
 from linkax.simulation.files import written_whole
-from linkax.studies.comparison import Comparison, Stepping, at_equal_cost, compare
+from linkax.studies.comparison import TIGHTEST, Comparison, Stepping, at_equal_cost, compare
 
 LADDER = (1e2, 1e1, 1.0, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances, of the one asked for, from which equal cost chooses
 STEP_LADDER = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # steps likewise
-TIGHTEST = 1e-13
 EQUAL = {"tolerance": "each at the same tolerance or step", "cost": "each in no more run time than the paper's needs"}
 
 

@@ -61,6 +61,12 @@ class Baumgarte(eqx.Module):
     beta: np.ndarray = parameter(5.0, "beta of Baumgarte [1/s]")
 
 
+def _in_units(at: Coefficients):
+    """M and J for speeds in radians and lengths of the mechanism."""
+    units = at.configuration.system.units
+    return at.mass * units[:, None] * units, at.jacobian * units
+
+
 class ClassicalFormulation(AbstractFormulation):
     """Accelerations of one of the classical methods, with a stabilisation and a correction as one likes.
 
@@ -106,7 +112,7 @@ class ClassicalFormulation(AbstractFormulation):
         """v̇ and λ, and what v̇ violates of the rows without stabilisation."""
         system, motion = at.configuration.system, move(at.configuration, v)
         force, right, units = generalised_force(motion), gamma(motion), system.units
-        mass, rows = at.mass * units[:, None] * units, at.jacobian * units
+        mass, rows = _in_units(at)
         if system.topology.num_rows == 0:
             return Dynamics(units * jnp.linalg.solve(mass, units * force), right, right)
         open_, rate_open = residual(at.configuration), at.jacobian @ v - rate(system, at.configuration.t)
@@ -129,9 +135,8 @@ class ClassicalFormulation(AbstractFormulation):
             return q, v, errors, one
 
         def inverse(q):
-            at, units = coefficients(system, t, q), system.units
-            scaled = at.mass * units[:, None] * units, at.jacobian * units
-            return at, units[:, None] * self.correction.right_inverse(*scaled)
+            at = coefficients(system, t, q)
+            return at, system.units[:, None] * self.correction.right_inverse(*_in_units(at))
 
         def closer(_, q):
             at, back = inverse(q)

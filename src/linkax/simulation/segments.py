@@ -14,7 +14,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.results import RESULTS
-from linkax.simulation.simulate import DEFAULT_MAX_STEPS, simulate
+from linkax.simulation.simulate import DEFAULT_MAX_STEPS, fixed_steps, simulate
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
 
@@ -70,11 +70,9 @@ def simulate_in_segments(
             accuracy=accuracy,
             solver=solver,
             formulation=formulation,
-            dt0=step,
-            stepsize_controller=None if step is None else diffrax.ConstantStepSize(),
             saveat=diffrax.SaveAt(ts=times),
-            max_steps=DEFAULT_MAX_STEPS if step is None else max(DEFAULT_MAX_STEPS, int(2.0 * t1 / step)),
             throw=False,
+            **fixed_steps(step, t1),
         )
         return jax.block_until_ready(found), time.perf_counter() - began
 

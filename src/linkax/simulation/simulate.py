@@ -116,6 +116,14 @@ def simulate(
     return solution
 
 
+def fixed_steps(step: float | None, t1: float) -> dict:
+    """Options of `simulate` for steps of a fixed size up to t1 [s]; none for None."""
+    if step is None:
+        return {}
+    most = max(DEFAULT_MAX_STEPS, int(2.0 * t1 / step))
+    return {"dt0": step, "stepsize_controller": diffrax.ConstantStepSize(), "max_steps": most}
+
+
 def _time(name, entry):
     array = jnp.asarray(entry, dtype=float) if isinstance(entry, jax.Array) else np.asarray(entry, dtype=np.float64)
     if array.shape != () or (known(array) is not None and not np.isfinite(known(array))):

@@ -21,7 +21,7 @@ from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.diagnosis import cause
 from linkax.simulation.report import result_name
 from linkax.simulation.results import RESULTS
-from linkax.simulation.simulate import DEFAULT_MAX_STEPS, DEFAULT_SAVES, simulate
+from linkax.simulation.simulate import DEFAULT_SAVES, fixed_steps, simulate
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
 
@@ -125,8 +125,18 @@ def compare(
     positions = lambda found: {name: np.asarray(found.position(*point)) for name, point in points.items()}
 
     def run(formulation, stepping, times=times, throw=False):
-        most = DEFAULT_MAX_STEPS if stepping.step is None else max(DEFAULT_MAX_STEPS, int(2.0 * t1 / stepping.step))
-        return jax.block_until_ready(_run(mechanism, state, times, formulation, stepping, most, throw))
+        found = simulate(
+            mechanism,
+            state,
+            t1=times[-1],
+            accuracy=Accuracy(rtol=TIGHTEST if stepping.rtol is None else stepping.rtol),
+            formulation=formulation,
+            solver=stepping.solver,
+            saveat=diffrax.SaveAt(ts=times),
+            throw=throw,
+            **fixed_steps(stepping.step, t1),
+        )
+        return jax.block_until_ready(found)
 
     report("compiling the reference run", None)
     reference = run(None, Stepping(diffrax.Dopri8(), rtol=TIGHTEST), throw=True)
@@ -145,24 +155,6 @@ def compare(
             trials.append(_trial(name, stepping, found, seconds, apart, bound, reference, passages, state))
     uncertainty = float(np.max(_apart(positions(other), answer)))
     return Comparison("reference run" if known is None else "closed form", uncertainty, bound, passages, trials)
-
-
-def _run(mechanism, state, times, formulation, stepping, most, throw) -> Solution:
-    fixed = {}
-    if stepping.step is not None:
-        fixed = {"dt0": stepping.step, "stepsize_controller": diffrax.ConstantStepSize()}
-    return simulate(
-        mechanism,
-        state,
-        t1=times[-1],
-        accuracy=Accuracy(rtol=TIGHTEST if stepping.rtol is None else stepping.rtol),
-        formulation=formulation,
-        solver=stepping.solver,
-        saveat=diffrax.SaveAt(ts=times),
-        max_steps=most,
-        throw=throw,
-        **fixed,
-    )
 
 
 def _timed(run, repeats):
