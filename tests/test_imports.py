@@ -8,7 +8,7 @@ import pytest
 import linkax
 
 SOURCE = Path(linkax.__file__).parent
-LAYERS = ["spatial", "model", "linalg", "equations", "formulations", "simulation", "analysis", "studies"]
+LAYERS = ["tracing", "spatial", "model", "linalg", "equations", "formulations", "simulation", "analysis", "studies"]
 LAYERS += ["scenes", "plotting", "cli"]
 
 

@@ -18,6 +18,7 @@ from linkax.model.numbers import value
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, cross, rotate, transpose
+from linkax.tracing import traced_once
 
 
 class Configuration(eqx.Module):
@@ -168,6 +169,7 @@ def bodies_of_cuts(topology):
     return np.array(topology.parent, dtype=int)[cuts], np.array(topology.child, dtype=int)[cuts], cuts
 
 
+@traced_once
 def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
     """Poses of all bodies and the motion subspaces of all joints at coordinates q."""
     topology, count = system.topology, system.topology.num_bodies

@@ -20,6 +20,7 @@ from linkax.equations.motion import Motion
 from linkax.equations.system import System
 from linkax.model.constraints import Drive
 from linkax.spatial.rotations import cross, dot, rotate, transpose
+from linkax.tracing import traced_once
 
 FLIP_WEIGHT = 2.0  # more than one: axes that point apart are farther from being in line than those at a right angle
 
@@ -209,6 +210,7 @@ def _bias(motion: Motion, rows: Rows):
     return -jnp.concatenate([rotation, translation])
 
 
+@traced_once
 def bias(motion: Motion) -> Float[Array, " m"]:
     """γ of J v̇ = γ less `drive_acceleration`: quadratic in the speeds."""
     system, configuration = motion.system, motion.configuration

@@ -13,6 +13,7 @@ from linkax.model.forces import Load
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import cross, rotate
+from linkax.tracing import traced_once
 
 
 class Motion(eqx.Module):
@@ -101,6 +102,7 @@ def _alone(values):
     return values[0] if len(values) == 1 else values
 
 
+@traced_once
 def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
     """Twists and velocity-product accelerations of all bodies at speeds v."""
     system = configuration.system

@@ -16,6 +16,7 @@ from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
 from linkax.model.numbers import known, number
+from linkax.tracing import traced_once
 
 
 def parameter(default: float, what: str):
@@ -122,13 +123,13 @@ class ClassicalFormulation(AbstractFormulation):
         acceleration = units * acceleration
         return Dynamics(acceleration, multipliers, at.jacobian @ acceleration - right)
 
-    @eqx.filter_jit  # traced once, however often a solver asks
+    @traced_once
     def derivative(self, system: System, t, q, v, correct: bool):
         q = on_manifold(system.topology, q)
         solved = self._solved(coefficients(system, t, q), v)
         return v, solved.acceleration, q, jnp.ones((), q.dtype)
 
-    @eqx.filter_jit
+    @traced_once
     def correct(self, system: System, t, q, v, errors=()):
         q, one = on_manifold(system.topology, q), jnp.ones((), q.dtype)
         if self.correction is None or system.topology.num_rows == 0:

@@ -10,6 +10,7 @@ from linkax.equations.configuration import Configuration, configure
 from linkax.equations.dynamics import mass_matrix
 from linkax.equations.loops import jacobian
 from linkax.equations.system import System
+from linkax.tracing import traced_once
 
 
 class Coefficients(NamedTuple):
@@ -20,6 +21,7 @@ class Coefficients(NamedTuple):
     mass: Float[Array, "n_v n_v"]
 
 
+@traced_once
 def coefficients(system: System, t, q) -> Coefficients:
     """Loop rows and mass matrix at coordinates q."""
     configuration = configure(system, t, q)

@@ -22,6 +22,7 @@ from linkax.formulations.branches import Crossing
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
 from linkax.formulations.passage import Course, Value, limit
 from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert_apart, with_mass
+from linkax.tracing import traced_once
 
 ROUNDING_ULPS = 8.0
 MOST_CORRECTIONS = 20
@@ -118,7 +119,7 @@ class TangentSpace(AbstractFormulation):
         step = lambda q, change: retract(system.topology, q, change)
         return limit(function, powers, (self, system, v), Course(t, q, v, system.units, step, is_driven(system)))
 
-    @eqx.filter_jit  # traced once, however often a solver asks
+    @traced_once
     def correct(self, system: System, t, q, v, errors=()):
         """q and v moved onto the manifold, for states close to it, and the distance d there.
 
@@ -137,7 +138,7 @@ class TangentSpace(AbstractFormulation):
             errors = jnp.where(jnp.abs(remaining[:, 0]) < open_, open_, remaining[:, 0]), remaining[:, 1]
         return instant.configuration.q, v, errors, split.distance
 
-    @eqx.filter_jit  # traced once, however often a solver asks
+    @traced_once
     def derivative(self, system: System, t, q, v, correct: bool):
         """v and v̇ at (t, q, v), corrected before the equations of motion are formed, q and d there."""
         if correct and system.topology.num_rows > 0:
@@ -164,7 +165,7 @@ class TangentSpace(AbstractFormulation):
         crossing = Crossing(instant.configuration, instant.jacobian, split)
         return Departure(crossing, instant.mass, acceleration, inverse.definiteness)
 
-    @eqx.filter_jit
+    @traced_once
     def dynamics(self, system: System, t, q, v) -> Dynamics:
         """Accelerations and multipliers at a state on the manifold."""
         instant = coefficients(system, t, q)
@@ -179,7 +180,7 @@ class TangentSpace(AbstractFormulation):
         violation = instant.jacobian @ acceleration - right
         return Dynamics(acceleration, multipliers, violation)
 
-    @eqx.filter_jit
+    @traced_once
     def close(self, system: System, t, q, v):
         """q and v on the manifold to rounding, from any state near it, with fresh factors."""
         if system.topology.num_rows == 0:
@@ -224,6 +225,7 @@ def _gap(system, t, q):
     return _largest(residual(configure(system, t, q)))
 
 
+@traced_once
 def _acceleration_at(arguments, t, q) -> Value:
     method, system, v = arguments
     gap = _gap(system, t, q)
@@ -232,6 +234,7 @@ def _acceleration_at(arguments, t, q) -> Value:
     return Value(answers, split.distance, gap)
 
 
+@traced_once
 def _closed_state(arguments, t, q) -> Value:
     method, system, v = arguments
     gap = _gap(system, t, q)

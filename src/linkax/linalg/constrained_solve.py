@@ -16,6 +16,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.tracing import traced_once
 
 
 class Inverse(NamedTuple):
@@ -39,6 +40,7 @@ class Inverse(NamedTuple):
     definiteness: Float[Array, ""]
 
 
+@traced_once
 def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     """Split the space of speeds by J and invert the saddle-point system on it.
 
@@ -178,6 +180,7 @@ def apply(inverse: Inverse, f, gamma):
     return a, inverse.compliance @ gamma - inverse.normal.T @ f
 
 
+@traced_once
 def constrained_solve(inverse: Inverse, mass, jacobian, f, gamma, sweeps: int = 1):
     """Solve M a = f + Jᵀλ, J a = γ, differentiably in M, J, f and γ, in both modes, to any order.
 
