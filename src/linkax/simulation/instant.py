@@ -130,16 +130,19 @@ class Instant(NamedTuple):
         return potential_energy(self.configuration)
 
     def violation(self):
+        return self._violated(self.dynamics)
+
+    def _violated(self, dynamics):
         configuration = self.configuration
         position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
         velocity = jacobian(configuration) @ self.v - rate(self.system, self.t)
-        return Violation(*map(_size, (position, velocity, self.dynamics.violation)))
+        return Violation(*map(_size, (position, velocity, dynamics.violation)))
 
     def violation_and_scales(self):
         """The violation, and the largest speed and acceleration of the joints [1/s, 1/s²]."""
-        units = self.system.units
+        dynamics, units = self.dynamics, self.system.units
         speed = _size(self.v / units)
-        return self.violation(), speed, jnp.maximum(_size(self.dynamics.acceleration / units), speed**2)
+        return self._violated(dynamics), speed, jnp.maximum(_size(dynamics.acceleration / units), speed**2)
 
     def _inverse(self):
         return self.tangent_space.crossing(self.system, self.t, self.q).inverse
