@@ -116,8 +116,13 @@ def test_compare_prints_verdicts_and_keeps_them(capsys, tmp_path):
 
 
 def test_compare_at_equal_cost_chooses_among_tolerances(capsys, tmp_path):
-    command = ["compare", "pendulum", "--t1", "2", "--formulations", "lagrange-multipliers", "--equal", "cost"]
-    assert main([*command, "--out", str(tmp_path), "--json", "--no-plots"]) == 0
-    ours, other = json.loads(capsys.readouterr().out)["trials"]
-    assert (ours["formulation"], other["formulation"]) == ("tangent-space", "lagrange-multipliers")
-    assert other["run_s"] <= 1.01 * max(ours["run_s"], 1e-12) or other["rtol"] > 1e-8
+    names = "lagrange-multipliers,lagrange-multipliers+projection"
+    command = ["compare", "crank-slider", "--variant", "regular", "--t1", "0.3", "--formulations", names]
+    assert main([*command, "--equal", "cost", "--out", str(tmp_path), "--json", "--no-plots"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [trial["formulation"] for trial in found["trials"]] == ["tangent-space", *names.split(",")]
+    assert found["trials"][0]["run_s"] <= found["budget_s"]
+    assert found["trials"][0]["rtol"] <= 1e-8
+    for trial in found["trials"]:
+        assert trial["verdict"] == "converged"
+        assert trial["error"] < 1e-3

@@ -54,13 +54,14 @@ def _compare(arguments):
         bound=arguments.bound,
         report=progress,
     )
-    trials = found.trials
+    trials, budget = found.trials, None
     if arguments.equal == "cost":
         own = Stepping(asked.solver, float(asked.accuracy.rtol), arguments.dt)
         budget = next(t.run_s for t in trials if t.formulation == TANGENT_SPACE and (t.step or t.rtol) == _size(own))
         trials = at_equal_cost(trials, budget)
     described = asked.described | {
         "equal": EQUAL[arguments.equal],
+        "budget_s": budget,
         "all_rows": arguments.all_rows,
         **found._asdict(),
         "verdicts": _verdicts(found),
@@ -127,12 +128,13 @@ def _for_people(described, found, trials, files):
     line = lambda row: "  ".join(
         [row[0].ljust(widths[0]), *(e.rjust(w) for e, w in zip(row[1:], widths[1:], strict=True))]
     )
+    budget = "" if described["budget_s"] is None else f", {1e3 * described['budget_s']:.1f} ms"
     answer = found.answer if found.answer == "closed form" else f"{found.answer}, good to {found.uncertainty:.0e} m"
     why = [f"  {trial.formulation}: {trial.why}" for trial in trials if trial.why]
     return "\n".join(
         [
             f"{described['scene']} {described['variant']}, {described['t1']:g} s, {described['solver']}, "
-            f"{steps_in_words(described)}; {described['equal']}",
+            f"{steps_in_words(described)}; {described['equal']}{budget}",
             f"error: largest distance from the {answer}; c, J v - b, J a - γ: worst violations, relative",
             described["verdicts"],
             "",
