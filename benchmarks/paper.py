@@ -207,7 +207,7 @@ def _figure_of_the_point(found, apart):
     below.set_ylabel("less exact [m]")
     below.set_xlabel("time [s]")
     above.set_title("Point C from α₁ = π/2, RK4 at 10 ms, and its error", fontsize="medium")
-    above.legend(frameon=False, loc="upper right")
+    figure.legend(*above.get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=2)
     for panel in (above, below):
         panel.grid(True, color="#E5E5E5")
     return figure
