@@ -258,14 +258,9 @@ def _verdicts(formulations, all_rows=True):
             repeats=1,
         ).trials
         for trial, steps in zip(trials, list(STEPPINGS) * len(formulations), strict=True):
-            text = f"{trial.error:.0e}" if trial.verdict == "converged" else _when(trial.why)
+            text = f"{trial.error:.0e}" if trial.diverged_at is None else f"✗ {trial.diverged_at:.2f} s"
             found.setdefault(trial.formulation, {})[variant, steps] = trial.verdict, text
     return found
-
-
-def _when(why):
-    """The time at which a trial diverged."""
-    return f"✗ {float(why.split(' at ')[1].split(' s')[0]):.2f} s"
 
 
 def table_5(out):

@@ -115,14 +115,27 @@ def test_compare_prints_verdicts_and_keeps_them(capsys, tmp_path):
         assert np.std(np.asarray(picture.convert("RGB"))) > 1.0
 
 
+SC2 = ["compare", "crank-slider", "--variant", "SC2", "--formulations"]  # singular at 0.4825 s
+BOTH = "lagrange-multipliers,lagrange-multipliers+projection"
+
+
 def test_compare_at_equal_cost_chooses_among_tolerances(capsys, tmp_path):
-    names = "lagrange-multipliers,lagrange-multipliers+projection"
-    command = ["compare", "crank-slider", "--variant", "regular", "--t1", "0.3", "--formulations", names]
-    assert main([*command, "--equal", "cost", "--out", str(tmp_path), "--json", "--no-plots"]) == 0
+    assert main([*SC2, BOTH, "--t1", "0.4", "--equal", "cost", "--out", str(tmp_path), "--json", "--no-plots"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert [trial["formulation"] for trial in found["trials"]] == ["tangent-space", *names.split(",")]
+    assert [trial["formulation"] for trial in found["trials"]] == ["tangent-space", *BOTH.split(",")]
     assert found["trials"][0]["run_s"] <= found["budget_s"]
     assert found["trials"][0]["rtol"] <= 1e-8
     for trial in found["trials"]:
         assert trial["verdict"] == "converged"
         assert trial["error"] < 1e-3
+
+
+def test_compare_tells_when_a_formulation_left_the_motion(capsys, tmp_path):
+    assert main([*SC2, BOTH, "--t1", "0.7", "--out", str(tmp_path), "--no-plots"]) == 0
+    printed = capsys.readouterr().out
+    left, stayed = json.loads((tmp_path / "comparison.json").read_text())["trials"]
+    assert (stayed["verdict"], stayed["diverged_at"], stayed["why"]) == ("converged", None, "")
+    assert left["verdict"] == "diverged"
+    assert 0.48 < left["diverged_at"] < 0.6
+    assert "loops closed to" in left["why"]
+    assert "last singular passage at 0.4825 s" in printed

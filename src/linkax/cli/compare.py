@@ -1,12 +1,12 @@
 """`linkax compare SCENE`: formulations side by side."""
 
 import json
-import math
 from pathlib import Path
 
 from linkax.cli.options import Run, add_run_options, end_progress, one_of, positive, progress, steps_in_words
 from linkax.formulations.named import BASES, COMPARED, TANGENT_SPACE, formulation
 from linkax.simulation.files import written_whole
+from linkax.simulation.report import finite
 from linkax.studies.comparison import TIGHTEST, Comparison, Stepping, at_equal_cost, compare
 
 LADDER = (1e2, 1e1, 1.0, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances, of the one asked for, from which equal cost chooses
@@ -65,7 +65,7 @@ def _compare(arguments):
         "all_rows": arguments.all_rows,
         **found._asdict(),
         "verdicts": _verdicts(found),
-        "trials": [_finite(trial._asdict()) for trial in trials],
+        "trials": [_entries(trial) for trial in trials],
     }
     with written_whole(out / "comparison.json") as path:
         path.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
@@ -94,10 +94,9 @@ def _steppings(asked, arguments):
     ]
 
 
-def _finite(entries):
-    """None in place of numbers that JSON does not have."""
-    bad = lambda entry: isinstance(entry, float) and not math.isfinite(entry)
-    return {name: None if bad(entry) else entry for name, entry in entries.items()}
+def _entries(trial):
+    """A trial for JSON."""
+    return {name: finite(entry) if isinstance(entry, float) else entry for name, entry in trial._asdict().items()}
 
 
 def _size(stepping):

@@ -49,26 +49,27 @@ def summary(run: TimedRun, points) -> dict:
         "rejected_steps": int(solution.stats["num_rejected_steps"]),
         "compile_s": run.compile_s,
         "run_s": run.run_s,
-        "position_violation": _finite(violation.position),
-        "velocity_violation": _finite(violation.velocity),
-        "acceleration_violation": _finite(violation.acceleration),
-        "energy_error": _finite(drift / scale if scale > 0.0 else drift),
+        "position_violation": finite(violation.position),
+        "velocity_violation": finite(violation.velocity),
+        "acceleration_violation": finite(violation.acceleration),
+        "energy_error": finite(drift / scale if scale > 0.0 else drift),
         "rank_min": int(np.min(rank, initial=rank[0] if len(rank) else 0)),
         "rank_max": int(np.max(rank, initial=0)),
-        "singularity_distance": _finite(np.min(np.asarray(solution.singularity_distance())[reached], initial=1.0)),
+        "singularity_distance": finite(np.min(np.asarray(solution.singularity_distance())[reached], initial=1.0)),
         "passages": [float(time) for time in passed.times],
-        "digits_lost": _finite(passed.digits),
+        "digits_lost": finite(passed.digits),
         "result": result_name(solution.result),
         "message": "" if result_name(solution.result) == "successful" else str(RESULTS[solution.result]),
-        "t_end": _finite(solution.t_end),
+        "t_end": finite(solution.t_end),
         "final": {
-            name: [_finite(part) for part in np.asarray(solution.position(body, at))[last]]
+            name: [finite(part) for part in np.asarray(solution.position(body, at))[last]]
             for name, (body, at) in points.items()
         },
     }
 
 
-def _finite(number):
+def finite(number):
+    """A number for JSON, which has no infinity: None in place of what is not finite."""
     return float(number) if np.isfinite(number) else None
 
 

@@ -46,6 +46,7 @@ class Trial(NamedTuple):
     - `energy_error`: largest difference from the reference run's energy, over its largest kinetic energy [J if none].
     - `steps`, `evaluations`: of the solver, and of the equations of motion in them. `run_s`: wall time [s].
     - `reached` [s]. `verdict`: "converged", or "diverged": the run ended early, or its error is above the bound.
+    - `diverged_at`: where it ended early, or its error first was above the bound [s]; None where it converged.
     - `why`: how it diverged, in words.
     """
 
@@ -62,6 +63,7 @@ class Trial(NamedTuple):
     run_s: float
     reached: float
     verdict: str
+    diverged_at: float | None
     why: str
 
 
@@ -189,16 +191,18 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
     kinetic = np.max(np.asarray(reference.kinetic_energy()))
     error = float(np.max(apart))
     verdict = "converged" if finished and error <= bound else "diverged"
-    why = ""
+    diverged_at, why = None, ""
     if not finished:
-        why = f"stopped at {float(found.t_end):.4g} s: {STOPPED.get(result_name(found.result), 'failed')}."
+        diverged_at = float(found.t_end)
+        why = f"stopped at {diverged_at:.4g} s: {STOPPED.get(result_name(found.result), 'failed')}."
         why += cause(found, state)
     elif verdict == "diverged":
         first = int(np.argmax(apart > bound))
         gap = float(found.violation().position[first])
         loops = f"loops open by {gap:.0e}" if gap > OPEN else f"loops closed to {gap:.0e}"
-        why = f"off by more than {bound:.2g} m at {found.ts[first]:.4g} s, {loops}"
-        before = [passage for passage in passages if passage <= found.ts[first]]
+        diverged_at = float(found.ts[first])
+        why = f"off by more than {bound:.2g} m at {diverged_at:.4g} s, {loops}"
+        before = [passage for passage in passages if passage <= diverged_at]
         why += f"; last singular passage at {before[-1]:.4g} s." if before else "."
     worst = found.worst_violation()
     steps = int(found.stats["num_steps"])
@@ -216,6 +220,7 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
         run_s=seconds,
         reached=float(found.t_end),
         verdict=verdict,
+        diverged_at=diverged_at,
         why=why,
     )
 
