@@ -202,7 +202,7 @@ def _figure_of_the_point(found, apart):
     place = np.asarray(found.position("coupler", at="tip"))
     for colour, index, name in zip(COLOURS, (0, 1), "xy", strict=False):
         above.plot(found.ts, place[:, index], color=colour, label=f"{name} of C")
-        below.plot(found.ts, apart[:, index], color=colour, label=name)
+        below.plot(found.ts, apart[:, index], color=colour)
     above.set_ylabel("position [m]")
     below.set_ylabel("less exact [m]")
     below.set_xlabel("time [s]")

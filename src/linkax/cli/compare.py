@@ -57,7 +57,7 @@ def _compare(arguments):
     trials, budget = found.trials, None
     if arguments.equal == "cost":
         own = Stepping(asked.solver, float(asked.accuracy.rtol), arguments.dt)
-        budget = next(t.run_s for t in trials if t.formulation == TANGENT_SPACE and (t.step or t.rtol) == _size(own))
+        budget = next(t.run_s for t in trials if t.formulation == TANGENT_SPACE and _size(t) == _size(own))
         trials = at_equal_cost(trials, budget)
     described = asked.described | {
         "equal": EQUAL[arguments.equal],

@@ -79,9 +79,12 @@ def simulate_in_segments(
     report("compiling", None)
     _, compile_s = run(state, 0.0, INSTANT * t1)
     report("integrating", 0.0)
-    first, run_s = run(state, 0.0, t1 / SEGMENTS)
     # A classical formulation keeps what it leaves open: a segment would begin on the loops again.
-    if formulation is not None or not _is_long(first, run_s):
+    uncut = formulation is not None
+    if not uncut:
+        first, run_s = run(state, 0.0, t1 / SEGMENTS)
+        uncut = not _is_long(first, run_s)
+    if uncut:
         whole, run_s = run(state, 0.0, t1)
         return TimedRun(whole, compile_s, run_s)
     parts, borders = [first], np.linspace(0.0, t1, SEGMENTS + 1)
