@@ -22,7 +22,7 @@ from linkax.equations.coordinates import neutral, on_manifold, rates, retract
 from linkax.equations.motion import move
 from linkax.equations.reactions import cut_reactions, reactions, seen_from
 from linkax.equations.system import system_of
-from linkax.spatial.rotations import cross
+from linkax.spatial.vectors import cross
 
 SIDES = ("child", "parent")
 DRAWS = settings(max_examples=4, deadline=None, derandomize=True, database=None)

@@ -17,7 +17,8 @@ from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.numbers import value
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
-from linkax.spatial.rotations import compose, cross, rotate, transpose
+from linkax.spatial.rotations import compose, rotate, transpose
+from linkax.spatial.vectors import cross
 from linkax.tracing import traced_once
 
 

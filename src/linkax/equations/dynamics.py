@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from linkax.equations.configuration import Configuration, by_body, over_subtree
 from linkax.equations.motion import Motion
 from linkax.model.forces import Load
-from linkax.spatial.rotations import compose, cross, dot, rotate, transpose
+from linkax.spatial.rotations import compose, rotate, transpose
+from linkax.spatial.vectors import cross, dot
 
 
 def world_inertia(configuration: Configuration) -> Float[Array, "n_b 3 3"]:
@@ -91,8 +92,18 @@ def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " 
 
 def generalised_force(motion: Motion) -> Float[Array, " n_v"]:
     """f of M v̇ = f: applied forces less velocity-product forces [N m, N]."""
+    return _unbalanced(motion, motion.angular_bias[:-1], motion.bias[:-1])
+
+
+def unbalanced_force(motion: Motion, acceleration: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
+    """f − M v̇, by recursive Newton-Euler, without M [N m, N]."""
+    return _unbalanced(motion, *body_accelerations(motion, acceleration))
+
+
+def _unbalanced(motion, angular_acceleration, acceleration):
+    """Applied forces less what accelerations of the bodies and of their reference points take."""
     load = applied_load(motion)
-    force, moment = inertial_wrench(motion, motion.angular_bias[:-1], motion.bias[:-1])
+    force, moment = inertial_wrench(motion, angular_acceleration, acceleration)
     return load.joint_force + along_speeds(motion.configuration, load.force - force, load.moment - moment)
 
 

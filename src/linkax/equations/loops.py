@@ -19,7 +19,8 @@ from linkax.equations.coordinates import by_speed
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
 from linkax.model.constraints import Drive
-from linkax.spatial.rotations import cross, dot, rotate, transpose
+from linkax.spatial.rotations import rotate, transpose
+from linkax.spatial.vectors import cross, dot
 from linkax.tracing import traced_once
 
 FLIP_WEIGHT = 2.0  # more than one: axes that point apart are farther from being in line than those at a right angle

@@ -12,7 +12,8 @@ from linkax.model.bodies import Frame
 from linkax.model.forces import Load
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
-from linkax.spatial.rotations import cross, rotate
+from linkax.spatial.rotations import rotate
+from linkax.spatial.vectors import cross
 from linkax.tracing import traced_once
 
 

@@ -11,7 +11,8 @@ from linkax.equations.dynamics import applied_load, body_accelerations, inertial
 from linkax.equations.loops import Rows, combined_rows, immobile_rows, plain_rows, sorted_multipliers
 from linkax.equations.motion import Motion
 from linkax.model.forces import Load
-from linkax.spatial.rotations import compose, cross, rotate, transpose
+from linkax.spatial.rotations import compose, rotate, transpose
+from linkax.spatial.vectors import cross
 
 Side = Literal["child", "parent"]
 Axes = Literal["ground", "joint"]

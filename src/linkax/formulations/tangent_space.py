@@ -8,18 +8,20 @@ formed; accelerations and multipliers follow from the same split.
 from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from linkax.equations.configuration import configure
-from linkax.equations.coordinates import on_manifold, retract, speeds
+from linkax.equations.coordinates import on_manifold, retract
 from linkax.equations.dynamics import generalised_force
 from linkax.equations.loops import gamma, is_driven, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.branches import Crossing
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
+from linkax.formulations.linearised import Changes, moved, unbalanced
 from linkax.formulations.passage import Course, Value, limit
 from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert_apart, with_mass
 from linkax.tracing import traced_once
@@ -87,10 +89,6 @@ class TangentSpace(AbstractFormulation):
         inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
         return constrained_solve(inverse, instant.mass, instant.jacobian, f, gamma, sweeps)
 
-    def _acceleration(self, instant, v, split, sweeps):
-        motion = move(instant.configuration, v)
-        return self._solve(split, instant, generalised_force(motion), gamma(motion), sweeps)[0]
-
     def _on_velocity_level(self, instant, v, split, sweeps):
         """The speeds nearest to v that satisfy J v = b."""
         weight, configuration = self._weight(instant), instant.configuration
@@ -103,7 +101,7 @@ class TangentSpace(AbstractFormulation):
         still = jnp.zeros(weight.shape[0], weight.dtype)
         return constrained_solve(split, weight, instant.jacobian, still, -rows, sweeps=0)[0]
 
-    def _corrected(self, system, t, q, v):
+    def _approximated(self, system, t, q, v):
         """One factorisation, at q; then a fixed number of corrections with it."""
         instant = coefficients(system, t, on_manifold(system.topology, q))
         split = self._split(instant)
@@ -113,6 +111,12 @@ class TangentSpace(AbstractFormulation):
             instant = coefficients(system, t, retract(system.topology, instant.configuration.q, step))
         v = self._on_velocity_level(instant, v, split, sweeps=2)
         return v, instant, split
+
+    def _onto(self, instant, split):
+        """Rows -> the smallest change of coordinates or speeds that changes them so much."""
+        weight = self._weight(instant)
+        still = jnp.zeros(weight.shape[0], weight.dtype)
+        return lambda rows: constrained_solve(split, weight, instant.jacobian, still, rows, sweeps=2)[0]
 
     def _limit(self, function, powers, system, t, q, v):
         """A function of (method, system, v), t and q at q, or as a limit along v."""
@@ -129,26 +133,21 @@ class TangentSpace(AbstractFormulation):
         """
         if system.topology.num_rows == 0:
             return on_manifold(system.topology, q), v, errors, jnp.ones((), q.dtype)
-        v, instant, split = self._corrected(system, t, q, v)
+        q, v, split = _corrected((self, system, t, q, v))
         if errors:
+            instant = lax.stop_gradient(coefficients(system, t, q))
             remaining = split.tangent @ (self._weight(instant) @ jnp.stack(errors, axis=1))
             # The factors are those of the state before its correction.
             remaining = remaining - split.normal @ (instant.jacobian @ remaining)
             open_ = _largest(residual(instant.configuration)) * system.units
             errors = jnp.where(jnp.abs(remaining[:, 0]) < open_, open_, remaining[:, 0]), remaining[:, 1]
-        return instant.configuration.q, v, errors, split.distance
+        return q, v, errors, split.distance
 
     @traced_once
     def derivative(self, system: System, t, q, v, correct: bool):
         """v and v̇ at (t, q, v), corrected before the equations of motion are formed, q and d there."""
-        if correct and system.topology.num_rows > 0:
-            v, instant, split = self._corrected(system, t, q, v)
-            acceleration = self._acceleration(instant, v, split, sweeps=2)
-        else:
-            instant = coefficients(system, t, q)
-            split = self._split(instant)
-            acceleration = self._acceleration(instant, v, split, sweeps=1)
-        return v, acceleration, instant.configuration.q, split.distance
+        found = _evaluated((self, system, t, q, v), correct and system.topology.num_rows > 0)
+        return found.v, found.acceleration, found.q, found.split.distance
 
     def crossing(self, system: System, t, q) -> Crossing:
         """The configuration as a crossing of branches."""
@@ -202,36 +201,85 @@ class TangentSpace(AbstractFormulation):
             gap = _largest(rows)
             done = (gap <= small) | (gap >= before)
             closer = retract(system.topology, q, self._step(instant, split, rows))
-            speeds = self._on_velocity_level(instant, v, split, sweeps=1)
-            return count + 1, jnp.where(done, q, closer), speeds, split.distance, gap, before
+            on_level = self._on_velocity_level(instant, v, split, sweeps=1)
+            return count + 1, jnp.where(done, q, closer), on_level, split.distance, gap, before
 
         far, one = jnp.asarray(jnp.finfo(q.dtype).max, q.dtype), jnp.ones((), q.dtype)
         begin = (jnp.zeros((), int), on_manifold(system.topology, q), v, one, far, 2.0 * far)
         _, q, v, distance, _, _ = lax.while_loop(unfinished, improve, begin)
         return q, v, distance
 
-    def _last_step(self, system, t, closed, q, v):
-        """What `close` does near a closed state, as a function to be differentiated."""
-        instant = coefficients(system, t, closed)
-        split, weight = self._split(instant), self._weight(instant)
-        away = weight @ speeds(system.topology, closed, q - closed)
-        rows = residual(instant.configuration)
-        q = retract(system.topology, closed, constrained_solve(split, weight, instant.jacobian, away, -rows)[0])
-        instant = coefficients(system, t, q)
-        return q, self._on_velocity_level(instant, v, split, sweeps=2)
-
 
 def _gap(system, t, q):
     return _largest(residual(configure(system, t, q)))
 
 
+class _Evaluated(NamedTuple):
+    """A state on the loops, its acceleration and multipliers, and the split that they follow from."""
+
+    q: Float[Array, " n_q"]
+    v: Float[Array, " n_v"]
+    acceleration: Float[Array, " n_v"]
+    multipliers: Float[Array, " m"]
+    split: Inverse
+
+
+def _constant(tree):
+    """The change of what does not change."""
+    return jax.tree.map(lambda _: None, tree)
+
+
+@eqx.filter_custom_jvp
+def _evaluated(arguments, correct) -> _Evaluated:
+    """The acceleration at a state, or at the one on the loops next to it."""
+    method, system, t, q, v = arguments
+    if correct:
+        v, instant, split = method._approximated(system, t, q, v)
+    else:
+        instant = coefficients(system, t, q)
+        split = method._split(instant)
+    motion = move(instant.configuration, v)
+    sides = generalised_force(motion), gamma(motion)
+    acceleration, multipliers = method._solve(split, instant, *sides, sweeps=2 if correct else 1)
+    return _Evaluated(instant.configuration.q, v, acceleration, multipliers, split)
+
+
+@_evaluated.def_jvp
+def _evaluated_jvp(primals, changes):
+    (arguments, correct), (changes, _) = primals, changes
+    method, system, t, _, _ = arguments
+    found = _evaluated(arguments, correct)
+    instant = coefficients(system, t, found.q)
+    onto = method._onto(instant, found.split) if correct else None
+    state = moved(onto, system, t, found.q, found.v, Changes(*changes[1:]))
+    sides = unbalanced(state, found.acceleration, found.multipliers)
+    acceleration, multipliers = method._solve(found.split, instant, *sides, sweeps=2)
+    return found, _Evaluated(state.to_q, state.to_v, acceleration, multipliers, _constant(found.split))
+
+
+@eqx.filter_custom_jvp
+def _corrected(arguments):
+    """The state on the loops next to one that is close, and the split that corrected it."""
+    method, system, t, q, v = arguments
+    v, instant, split = method._approximated(system, t, q, v)
+    return instant.configuration.q, v, split
+
+
+@_corrected.def_jvp
+def _corrected_jvp(primals, changes):
+    (arguments,), (changes,) = primals, changes
+    method, system, t, _, _ = arguments
+    q, v, split = _corrected(arguments)
+    onto = method._onto(coefficients(system, t, q), split)
+    state = moved(onto, system, t, q, v, Changes(*changes[1:]))
+    return (q, v, split), (state.to_q, state.to_v, _constant(split))
+
+
 @traced_once
 def _acceleration_at(arguments, t, q) -> Value:
     method, system, v = arguments
-    gap = _gap(system, t, q)
-    v, instant, split = method._corrected(system, t, q, v)
-    answers = instant.configuration.q, method._acceleration(instant, v, split, sweeps=2)
-    return Value(answers, split.distance, gap)
+    found = _evaluated((method, system, t, q, v), True)
+    return Value((found.q, found.acceleration), found.split.distance, _gap(system, t, q))
 
 
 @traced_once
@@ -250,13 +298,11 @@ def _close(arguments):
 
 
 @_close.def_jvp
-def _close_jvp(primals, tangents):
-    """The nearest state on the loops, linearised where they close."""
-    (arguments,), (tangent,) = primals, tangents
-    closed = _close(arguments)
-
-    def last_step(arguments):
-        method, system, t, q, v = arguments
-        return method._last_step(system, t, closed[0], q, v)
-
-    return closed, eqx.filter_jvp(last_step, (arguments,), (tangent,))[1]
+def _close_jvp(primals, changes):
+    (arguments,), (changes,) = primals, changes
+    method, system, t, _, _ = arguments
+    q, v = _close(arguments)
+    instant = coefficients(system, t, q)
+    onto = method._onto(instant, method._split(instant))
+    state = moved(onto, system, t, q, v, Changes(*changes[1:]))
+    return (q, v), (state.to_q, state.to_v)

@@ -11,7 +11,7 @@ from linkax.model.bodies import Frame, frame_of
 from linkax.model.functions import Law, evaluated, number_or_law
 from linkax.model.numbers import number, require
 from linkax.model.terms import Term, term
-from linkax.spatial.rotations import dot
+from linkax.spatial.vectors import dot
 
 
 class Load(NamedTuple):

@@ -15,7 +15,8 @@ from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
-from linkax.spatial.rotations import cross, rotate
+from linkax.spatial.rotations import rotate
+from linkax.spatial.vectors import cross
 
 UNCHANGED = 1e-6  # by a self-stress of magnitude one
 

@@ -184,6 +184,10 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         closest = jnp.minimum(closest, jnp.minimum(passes, arrives))
         return y1, StepError(error, leaves_now, passes, retry), dense_info, (inner, arrives, closest), result
 
+    def corrected(self, problem: Problem, t1, y1):
+        """The state that a step leaves."""
+        return _corrected(problem, t1, y1, None)[0] if self.after_step else y1
+
     def _stages(self, dense_info, duration):
         """Distances at the stages of a Runge-Kutta step, where this is one."""
         if not (isinstance(dense_info, dict) and "k" in dense_info and hasattr(self.solver, "tableau")):

@@ -18,7 +18,8 @@ from linkax.model.numbers import known
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.diagnosis import cause
 from linkax.simulation.integration import MechanismControl, Problem, Projected
-from linkax.simulation.outset import depart
+from linkax.simulation.outset import Outset, depart
+from linkax.simulation.replay import Course, Steps, integrate, is_replayable
 from linkax.simulation.results import RESULTS, SimulationError
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
@@ -91,7 +92,10 @@ def simulate(
         formulation = named_formulation(formulation)
     if not (formulation is None or isinstance(formulation, AbstractFormulation)):
         raise ValueError(f"formulation is {formulation!r}; give a name, a linkax.ClassicalFormulation, or None")
-    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    solver = diffrax.Dopri8() if solver is None else solver
+    replayed = adjoint is None and _saves_states(saveat) and is_replayable(solver, saveat, event, max_steps)
+    if adjoint is None:
+        adjoint = diffrax.ForwardMode() if replayed else diffrax.RecursiveCheckpointAdjoint()
     # Compiled apart, so that another solver, formulation or saveat compiles no more than it must.
     mechanism, accuracy, outset = _start(mechanism, state, t0, accuracy, dtype)
     found, formulation = _integrate(
@@ -103,9 +107,10 @@ def simulate(
         t1,
         dt0 if dt0 is None else np.asarray(dt0, dtype=np.float64),
         saveat,
-        Projected.around(diffrax.Dopri8() if solver is None else solver, accuracy, adjoint),
+        Projected.around(solver, accuracy, adjoint),
         MechanismControl(_traced_tolerances(stepsize_controller)),
         adjoint,
+        replayed,
         event,
         diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
         max_steps,
@@ -237,6 +242,7 @@ def _integrate(
     solver,
     controller,
     adjoint,
+    replayed,
     event,
     progress_meter,
     max_steps,
@@ -246,33 +252,68 @@ def _integrate(
     problem = _problem(mechanism, accuracy, outset, formulation)
     if saveat is None:
         saveat = diffrax.SaveAt(ts=jnp.linspace(t0, t1, DEFAULT_SAVES, dtype=dtype))
-    subs = saveat.subs if _saves_states(saveat) else _wrapped_saves(saveat.subs)
-    saveat = eqx.tree_at(
-        lambda s: (s.subs, s.solver_state),
-        saveat,
-        ((subs, diffrax.SubSaveAt(t1=True)), True),
-        is_leaf=lambda leaf: leaf is None,
-    )
-    found = diffrax.diffeqsolve(
-        diffrax.ODETerm(_derivative),
-        solver,
-        t0,
-        t1,
-        dt0,
-        problem.packed(outset.state.q, outset.state.v),
-        problem,
-        saveat=saveat,
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        event=_wrapped_event(event),
-        max_steps=max_steps,
-        throw=False,
-        progress_meter=progress_meter,
-    )
-    (ts, t_end), (ys, y_end) = found.ts, found.ys
-    result = _result(found.result, outset, controller.is_adaptive)
-    closest = found.solver_state[2]
-    return _Found(ts, ys, t_end, y_end, found.stats, result, closest, found.interpolation), formulation
+    if not _saves_states(saveat):
+        saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))
+    y0 = problem.packed(outset.state.q, outset.state.v)
+    event = _wrapped_event(event)
+    integration = _Integration(outset, dt0, saveat, solver, controller, adjoint, event, progress_meter, max_steps)
+    if replayed:
+        return integrate(Course(problem, y0, t0, t1, saveat.subs.ts), integration), formulation
+    return integration(Course(problem, y0, t0, t1, None), False)[0], formulation
+
+
+class _Integration(eqx.Module):
+    """diffrax's integration of a course, with all its options."""
+
+    outset: Outset
+    dt0: Any
+    saveat: diffrax.SaveAt
+    solver: Projected
+    controller: MechanismControl
+    adjoint: diffrax.AbstractAdjoint
+    event: Any
+    progress_meter: diffrax.AbstractProgressMeter
+    max_steps: int = eqx.field(static=True)
+
+    def __call__(self, course: Course, track: bool):
+        """What the integration leaves, and its steps if they are to be tracked."""
+        end, steps = diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t0=True, steps=True)
+        saveat = self.saveat
+        if course.saved is not None:
+            saveat = eqx.tree_at(lambda s: s.subs.ts, saveat, course.saved)
+        saveat = eqx.tree_at(
+            lambda s: (s.subs, s.solver_state),
+            saveat,
+            ((saveat.subs, end, steps) if track else (saveat.subs, end), True),
+            is_leaf=lambda leaf: leaf is None,
+        )
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(_derivative),
+            self.solver,
+            course.t0,
+            course.t1,
+            self.dt0,
+            course.y0,
+            course.problem,
+            saveat=saveat,
+            stepsize_controller=self.controller,
+            adjoint=self.adjoint,
+            event=self.event,
+            max_steps=self.max_steps,
+            throw=False,
+            progress_meter=self.progress_meter,
+        )
+        (ts, t_end, *times), (ys, y_end, *states) = found.ts, found.ys
+        result = _result(found.result, self.outset, self.controller.is_adaptive)
+        closest = found.solver_state[2]
+        steps = Steps(times[0], states[0], found.stats["num_accepted_steps"]) if track else None
+        return _Found(ts, ys, t_end, y_end, found.stats, result, closest, found.interpolation), steps
+
+    def rows(self, y0, saved, end):
+        """What diffrax saves, of values at the start, at saved times, and at the end."""
+        sub = self.saveat.subs
+        parts = [y0[None]] * sub.t0 + [saved] * (sub.ts is not None) + [end[None]] * sub.t1
+        return jnp.concatenate(parts)
 
 
 @eqx.filter_jit

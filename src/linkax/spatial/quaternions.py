@@ -6,7 +6,7 @@ rotation. Smooth everywhere, at no rotation too.
 
 import jax.numpy as jnp
 
-from linkax.spatial.rotations import cross, dot
+from linkax.spatial.vectors import cross, dot
 
 SMALL = 1e-8  # squares of half angles for which two terms of the series are exact
 

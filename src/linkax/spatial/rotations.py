@@ -11,23 +11,6 @@ COORDINATE_AXES = {
 }
 
 
-def cross(a, b):
-    """Vector product along the last axis, shape (..., 3)."""
-    return jnp.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )
-
-
-def dot(a, b):
-    """Scalar product along the last axis, shape (...)."""
-    return jnp.sum(a * b, axis=-1)
-
-
 def rotate(rotation, vector):
     """Rotate vectors (..., 3) by rotations (..., 3, 3)."""
     return jnp.sum(rotation * vector[..., None, :], axis=-1)
