@@ -77,3 +77,5 @@ from linkax.studies.comparison import Comparison as Comparison  # noqa: E402
 from linkax.studies.comparison import Stepping as Stepping  # noqa: E402
 from linkax.studies.comparison import Trial as Trial  # noqa: E402
 from linkax.studies.comparison import compare as compare  # noqa: E402
+from linkax.studies.sweep import Sweep as Sweep  # noqa: E402
+from linkax.studies.sweep import sweep as sweep  # noqa: E402

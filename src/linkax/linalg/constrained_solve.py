@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.linalg.triangular import cholesky_inverse, upper_inverse
 from linkax.tracing import traced_once
 
 
@@ -89,7 +89,7 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     triangle = jnp.where(active[:, None] & active[None, :], r[:, :count][:count], identity)
     # Undo the permutation and the scale of the rows, and the units of the speeds.
     chosen = order[:count]
-    on_rows = jnp.where(active[:, None], solve_triangular(triangle, identity), 0.0) * scale[chosen][:, None]
+    on_rows = jnp.where(active[:, None], upper_inverse(triangle), 0.0) * scale[chosen][:, None]
     rows_inverse = jnp.zeros((rows, count), dtype).at[chosen].set(on_rows, unique_indices=True)
     basis = units[:, None] * (to_metric.T @ q)
     is_normal = jnp.zeros(n, bool).at[:count].set(active)
@@ -169,9 +169,8 @@ def _ratio(a, b, otherwise):
 
 def _lower_inverse(matrix):
     """L⁻¹ of a positive definite matrix L Lᵀ, and its definiteness (see `Inverse`)."""
-    lower = jnp.linalg.cholesky(matrix, symmetrize_input=False)
-    definiteness = jnp.min(_ratio(jnp.diagonal(lower) ** 2, jnp.diagonal(matrix), 0.0), initial=1.0)
-    return solve_triangular(lower, jnp.eye(matrix.shape[0], dtype=matrix.dtype), lower=True), definiteness
+    inverse, diagonal = cholesky_inverse(matrix)
+    return inverse, jnp.min(_ratio(diagonal**2, jnp.diagonal(matrix), 0.0), initial=1.0)
 
 
 def apply(inverse: Inverse, f, gamma):

@@ -114,8 +114,15 @@ def frame_of(place, what) -> Frame:
     raise ValueError(f"{what} is {place!r}; give a body, body.at(...), or lx.GROUND")
 
 
+def _depth(entry) -> int:
+    """Number of dimensions of an array, or of lists of numbers that may be traced."""
+    if isinstance(entry, list | tuple):
+        return 1 + (_depth(entry[0]) if entry else 0)
+    return np.ndim(entry)
+
+
 def _inertia_tensor(inertia, what):
-    diagonal = np.ndim(value(inertia)) == 1 if not hasattr(inertia, "shape") else len(inertia.shape) == 1
+    diagonal = _depth(value(inertia)) == 1
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)
     if diagonal:
         tensor = tensor * np.eye(3)

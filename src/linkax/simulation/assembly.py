@@ -60,7 +60,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
-    raised; `linkax.simulate` marks such a state in its result.
+    raised: the speeds are not numbers then, and `linkax.simulate` says so in its result.
     """
     positions, guess = (
         coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess"))
@@ -70,8 +70,9 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
     state, remainder = _assemble(mechanism, positions, speeds, guess, jnp.asarray(t, float))
-    if known(state.q) is not None:
-        _raise_if_open(mechanism, state, t, jax.tree.map(np.asarray, remainder))
+    if known(state.q) is None:
+        return State(state.q, jnp.where(remainder.is_met(), state.v, jnp.nan))
+    _raise_if_open(mechanism, state, t, jax.tree.map(np.asarray, remainder))
     return state
 
 
@@ -82,11 +83,11 @@ def _raise_if_open(mechanism, state, t, remainder):
     advice = "check lengths and offsets, hold fewer positions, or give another guess"
     cuts = topology.joints[topology.num_bodies :]
     for name, distance, angle in zip(cuts, remainder.gap.distance, remainder.gap.angle, strict=True):
-        for size, unit, scale in ((distance, "m", remainder.length), (angle, "rad", 1.0)):
-            if not size <= CLOSED * scale:
+        for size, unit, most in ((distance, "m", CLOSED * remainder.length), (angle, "rad", CLOSED)):
+            if not size <= most:
                 raise AssemblyError(f"joint {name!r} does not close: {remains(size, unit)}; {advice}")
     for constraint, size in zip(mechanism.constraints, remainder.gap.constraints, strict=True):
-        if not size <= CLOSED * max(remainder.length, 1.0):
+        if not size <= remainder.most:
             joints = ", ".join(map(repr, constraint.joints))
             raise AssemblyError(
                 f"{constraint.described} of joint {joints} is not met at t = {float(t):.6g} s: "
@@ -94,7 +95,7 @@ def _raise_if_open(mechanism, state, t, remainder):
             )
     for what, misses in (("position", remainder.positions), ("speed", remainder.speeds)):
         for along, miss in zip(misses.terms, misses.values, strict=True):
-            if not np.all(np.abs(miss) <= CLOSED * max(remainder.length, 1.0)):
+            if not np.all(np.abs(miss) <= remainder.most):
                 size = np.max(np.abs(miss))
                 raise AssemblyError(
                     f"the {what} asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not "
@@ -118,6 +119,17 @@ class _Remainder(eqx.Module):
     positions: Given
     speeds: Given
     off_branch: jax.Array
+
+    @property
+    def most(self):
+        """What coordinates and speeds may miss."""
+        return CLOSED * jnp.maximum(self.length, 1.0)
+
+    def is_met(self):
+        """Whether the loops are closed and all that is held is where it should be."""
+        missed = [*self.positions.values, *self.speeds.values, self.gap.constraints]
+        met = jnp.all(self.gap.distance <= CLOSED * self.length) & jnp.all(self.gap.angle <= CLOSED)
+        return met & jnp.array([jnp.all(jnp.abs(miss) <= self.most) for miss in missed]).all()
 
 
 class _Demand(eqx.Module):

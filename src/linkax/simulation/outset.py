@@ -24,12 +24,14 @@ class Outset(NamedTuple):
     """A state that motion starts from, put on the closed loops.
 
     - `rank`: of J at the states next to it along the motion, for each island of the mechanism.
+    - `assembled`: not marked by `linkax.assemble`, by speeds that are no numbers, as a state that it did not find.
     - `finite`, `closed`; `massive`: all that can move has mass; `on_branch`: the speeds lie on a
       branch of the motion; `unique`: so does, at rest, the acceleration.
     """
 
     state: State
     rank: Int[Array, " k"]
+    assembled: Bool[Array, ""]
     finite: Bool[Array, ""]
     massive: Bool[Array, ""]
     closed: Bool[Array, ""]
@@ -57,11 +59,12 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     crossing, mass, acceleration, definiteness = method.departure(system, t, q)
     eps = jnp.finfo(system.dtype).eps
     massive = definiteness > SINGULAR_ULPS * eps * len(v)
+    assembled = jnp.logical_not(jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isnan(state.v)) & (len(state.v) > 0))
     finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & jnp.all(jnp.isfinite(mass))
     finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, acceleration, 0.0)))
     if system.topology.num_rows == 0:
         true = jnp.ones((), bool)
-        return Outset(start, crossing.inverse.rank, finite, massive, true, true, true)
+        return Outset(start, crossing.inverse.rank, assembled, finite, massive, true, true, true)
     gap = gaps(crossing.configuration)
     small = jnp.sqrt(eps)
     at_rest = crossing.fastest(v) ** 2 <= eps * crossing.fastest(acceleration)
@@ -71,6 +74,7 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     return Outset(
         state=start,
         rank=rank,
+        assembled=assembled,
         finite=finite,
         massive=massive,
         closed=jnp.all(gap.distance <= small * system.length)

@@ -12,6 +12,7 @@ KNOWN_RESULTS = (
     "dt_min_reached",
     "diverged",
     "event_occurred",
+    "not_assembled",
     "not_closed",
     "no_branch",
     "not_unique",

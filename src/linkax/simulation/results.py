@@ -10,6 +10,10 @@ class RESULTS(diffrax.RESULTS):
         "The loops of the initial state do not close. Make the state with `linkax.assemble`, which says which "
         "joint is open, and how far."
     )
+    not_assembled = (
+        "The loops cannot be closed with the positions and speeds that `linkax.assemble` was given. Outside of JAX "
+        "transformations it says which joint is open, and how far."
+    )
     no_branch = (
         "The initial configuration is singular, and the initial speeds lie on no branch of the motion. Make the state "
         "with `linkax.assemble`, which finds speeds on a branch."

@@ -359,13 +359,14 @@ def _result(result, outset, is_adaptive):
     result = RESULTS.where(outset.on_branch, result, RESULTS.no_branch)
     result = RESULTS.where(outset.closed, result, RESULTS.not_closed)
     result = RESULTS.where(outset.massive, result, RESULTS.massless)
-    return RESULTS.where(outset.finite, result, RESULTS.not_finite)
+    result = RESULTS.where(outset.finite, result, RESULTS.not_finite)
+    return RESULTS.where(outset.assembled, result, RESULTS.not_assembled)
 
 
 def _raise_if_failed(solution, state):
     if (solution.result == RESULTS.successful) | (solution.result == RESULTS.event_occurred):
         return
-    at_start = ("not_finite", "massless", "not_closed", "no_branch", "not_unique")
+    at_start = ("not_finite", "not_assembled", "massless", "not_closed", "no_branch", "not_unique")
     before = any(solution.result == getattr(RESULTS, name) for name in at_start)
     when = "before it began" if before else f"at t = {float(solution.t_end):.6g} s"
     raise SimulationError(f"simulation stopped {when}: {RESULTS[solution.result]}{cause(solution, state)}", solution)

@@ -1,0 +1,91 @@
+"""Inverses of triangular factors, for one matrix by LAPACK, for batches of small ones in compiled loops.
+
+A batch of small matrices spends its time in calling LAPACK. And jaxlib (0.10) lets a call for a batch wait for threads
+of the pool that it runs in itself: several programs at once on one CPU can wait for each other for ever.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+SMALL = 32  # rows, up to which elimination serves batches
+
+
+def cholesky_inverse(matrix: Float[Array, "n n"]):
+    """L⁻¹ of a positive definite matrix L Lᵀ, and the diagonal of L; not numbers where it is not definite."""
+    return _cholesky_inverse(matrix)
+
+
+def upper_inverse(triangle: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """R⁻¹ of an upper triangular matrix R."""
+    return _upper_inverse(triangle)
+
+
+def _by_lapack(matrix):
+    lower = jnp.linalg.cholesky(matrix, symmetrize_input=False)
+    identity = jnp.eye(len(matrix), dtype=matrix.dtype)
+    return solve_triangular(lower, identity, lower=True), jnp.diagonal(lower)
+
+
+def _by_elimination(matrix):
+    """Rows of [A, I] less multiples of those above: [Lᵀ, L⁻¹]."""
+    n = len(matrix)
+    rows = jnp.arange(n)
+
+    def eliminate(k, work):
+        column = work[:, k]
+        size = jnp.sqrt(column[k])
+        row = work[k] / size
+        factor = jnp.where(rows > k, column / size, 0.0)
+        return jnp.where((rows == k)[:, None], row, work - factor[:, None] * row)
+
+    work = lax.fori_loop(0, n, eliminate, jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1))
+    return work[:, n:], jnp.diagonal(work[:, :n])
+
+
+def _upper_by_lapack(triangle):
+    return solve_triangular(triangle, jnp.eye(len(triangle), dtype=triangle.dtype))
+
+
+def _upper_by_elimination(triangle):
+    """Rows of [R, I] less multiples of those below: [I, R⁻¹]."""
+    n = len(triangle)
+    rows = jnp.arange(n)
+
+    def eliminate(done, work):
+        k = n - 1 - done
+        column = work[:, k]
+        row = work[k] / column[k]
+        factor = jnp.where(rows < k, column, 0.0)
+        return jnp.where((rows == k)[:, None], row, work - factor[:, None] * row)
+
+    work = lax.fori_loop(0, n, eliminate, jnp.concatenate([triangle, jnp.eye(n, dtype=triangle.dtype)], axis=1))
+    return work[:, n:]
+
+
+def _for_batches(single, batched):
+    """A function of a matrix, computed in another way in batches of small ones."""
+
+    @jax.custom_batching.custom_vmap
+    def function(matrix):
+        outer, shape = matrix.shape[:-2], matrix.shape[-2:]
+        if not outer:
+            return single(matrix)
+        mapped = jax.vmap(batched if shape[0] <= SMALL else single)
+        found = mapped(matrix.reshape(math.prod(outer), *shape))
+        return jax.tree.map(lambda part: part.reshape(*outer, *part.shape[1:]), found)
+
+    @function.def_vmap
+    def _(_size, _batched, matrix):
+        found = function(matrix)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return function
+
+
+_cholesky_inverse = _for_batches(_by_lapack, _by_elimination)
+_upper_inverse = _for_batches(_upper_by_lapack, _upper_by_elimination)

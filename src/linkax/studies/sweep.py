@@ -1,0 +1,301 @@
+"""One function over many sets of parameters."""
+
+import concurrent.futures
+import itertools
+import os
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, PartitionSpec
+from tqdm import tqdm
+
+from linkax.simulation.report import KNOWN_RESULTS
+from linkax.simulation.results import RESULTS
+from linkax.studies.sweep_store import SweepStore
+
+DEFAULT_CHUNK = 256  # members on one device: more take no less time each
+DEFAULT_MEMORY = 2**31  # bytes
+FINE = ("successful", "event_occurred")
+REASONS = (*KNOWN_RESULTS, "failed", "not_finite_output", "not_run")
+NOT_FINITE_OUTPUT, NOT_RUN = (REASONS.index(name) for name in ("not_finite_output", "not_run"))
+EXPLANATIONS = {
+    "failed": "failed",
+    "not_finite_output": "The function returned numbers that are not finite, and no solution or result that tells why.",
+    "not_run": "This member has not been run.",
+}
+
+
+class Sweep(NamedTuple):
+    """What a function returned for each member of a batch.
+
+    - `output`: as the function returns it, arrays with a leading axis of members. In members that failed it is what
+      they left.
+    - `reasons`: index into `linkax.studies.sweep.REASONS` of how each member ended, (n,).
+    - `seconds_per_member`: wall time, compilation left out [s]; not a number where nothing was left to run.
+    """
+
+    output: Any
+    reasons: np.ndarray
+    seconds_per_member: float
+
+    @property
+    def ok(self) -> np.ndarray:
+        """Which members went well, (n,)."""
+        return np.isin(self.reasons, [REASONS.index(name) for name in FINE])
+
+    @property
+    def failed(self) -> dict[int, str]:
+        """{member: why it failed}."""
+        return {int(member): self.reason(member) for member in np.flatnonzero(~self.ok)}
+
+    def reason(self, member: int) -> str:
+        """How a member ended, in words."""
+        name = REASONS[self.reasons[member]]
+        return EXPLANATIONS[name] if name in EXPLANATIONS else RESULTS[getattr(RESULTS, name)]
+
+    def count(self) -> dict[str, int]:
+        """How many members ended in which way: {name of a result: number}."""
+        return {name: int(np.sum(self.reasons == index)) for index, name in enumerate(REASONS) if index in self.reasons}
+
+
+def sweep(
+    function: Callable,
+    params: Any,
+    *,
+    chunk: int | None = None,
+    memory: float = DEFAULT_MEMORY,
+    devices: list | None = None,
+    difficulty: Callable | np.ndarray | None = None,
+    store: str | os.PathLike | None = None,
+    progress: bool | None = None,
+) -> Sweep:
+    """Evaluate a function for every set of parameters of a batch: compiled once, in chunks, on all devices.
+
+    Members are independent: one that fails is marked and changes no other. A function that returns a `Solution`, or
+    a `solution.result` beside what it computes, says why; of others numbers that are not finite count as a failure.
+
+    **Arguments:**
+
+    - `function`: params -> arrays in any pytree, `Solution` included. A pure function that JAX can trace.
+    - `params`: pytree of arrays with one leading axis of members.
+    - `chunk`: members that one device computes together; default 256, or fewer where they need more than `memory`.
+    - `memory`: of each device, for one chunk [bytes].
+    - `devices`: default all of this process. A CPU counts as one, and computes one chunk on each of its cores. In a job
+      of several processes (`jax.distributed`) each computes its share, and all return the whole.
+    - `difficulty`: numbers (n,), or a function of params that gives one, such as the steps of a run at `linkax.DRAFT`.
+      Members of like difficulty share a chunk: a chunk takes as long as its slowest member.
+    - `store`: a folder, in which results are kept as they come, in Zarr format. A sweep that was killed goes on from
+      there; one of another function or other parameters is refused.
+    - `progress`: show a bar; default: where someone watches.
+
+    **Raises:** `ValueError` for a batch that is none, and for a store of another sweep.
+    """
+    params = jax.tree.map(jnp.asarray, params)
+    count = _members(params)
+    devices = list(jax.local_devices()) if devices is None else list(devices)
+    if chunk is not None and not (isinstance(chunk, int) and chunk > 0):
+        raise ValueError(
+            f"chunk is {chunk!r}; it must be a positive integer: members that one device computes together"
+        )
+    if not memory > 0:
+        raise ValueError(f"memory is {memory!r}; it must be a positive number of bytes")
+    order = _order(difficulty, params, count, dict(chunk=chunk, memory=memory, devices=devices))
+    bar = tqdm(total=count, unit="member", desc="compiling", disable=_hides(progress), smoothing=0.05)
+    with bar:
+        program = _Program.compiled(function, params, chunk or min(DEFAULT_CHUNK, count), memory, devices)
+        bar.set_description("sweeping")
+        kept = None if store is None else SweepStore.opened(store, program, params, order)
+        found, seconds, ran = _run(program, params, order, kept, bar)
+    arrays, reasons = found if jax.process_count() == 1 else _gathered(found)
+    back = np.argsort(order)
+    output = eqx.combine(jax.tree.map(lambda array: array[back], arrays), program.static)
+    return Sweep(output, reasons[back], seconds / ran if ran else float("nan"))
+
+
+def _members(params) -> int:
+    sizes = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(params)}
+    if len(sizes) != 1 or sizes == {()} or sizes == {(0,)}:
+        shapes = {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in jax.tree.leaves_with_path(params)}
+        raise ValueError(f"params have shapes {shapes}; give every array the same leading axis, one entry per member")
+    return sizes.pop()[0]
+
+
+def _order(difficulty, params, count, options):
+    """In which order members run: the difficult ones first."""
+    if difficulty is None:
+        return np.arange(count)
+    if callable(difficulty):
+        difficulty = sweep(difficulty, params, progress=False, **options).output
+    difficulty = np.asarray(difficulty)
+    if difficulty.shape != (count,):
+        raise ValueError(f"difficulty has shape {difficulty.shape}; give one number for each of {count} members")
+    return np.argsort(-np.nan_to_num(difficulty.astype(float), nan=np.inf), kind="stable")
+
+
+def _hides(progress):
+    return None if progress is None else not progress
+
+
+def _is_result(node):
+    return isinstance(node, type(RESULTS.successful)) and node._enumeration is RESULTS
+
+
+def _member(function):
+    """A function's arrays, and how the member ended, as an index into `REASONS`."""
+
+    def run(params):
+        output = function(params)
+        arrays, _ = eqx.partition(output, eqx.is_array)
+        results = [node for node in jax.tree.leaves(output, is_leaf=_is_result) if _is_result(node)]
+        numbers = [leaf for leaf in jax.tree.leaves(arrays) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+        finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in numbers]).all()
+        reason = jnp.zeros((), jnp.int8) if results else jnp.where(finite, 0, NOT_FINITE_OUTPUT).astype(jnp.int8)
+        for result in results:
+            reason = jnp.where(reason == 0, _reason(result), reason)
+        return arrays, reason
+
+    return run
+
+
+def _reason(result):
+    found = jnp.asarray(REASONS.index("failed"), jnp.int8)
+    for index, name in enumerate(KNOWN_RESULTS):
+        found = jnp.where(result == getattr(RESULTS, name), index, found).astype(jnp.int8)
+    return found
+
+
+class _Program(NamedTuple):
+    """The compiled function, of `size` members at once.
+
+    - `outputs`: shapes of its arrays. `static`: what of the output is no array.
+    - `text`: of the program, the same for the same function.
+    """
+
+    run: Callable
+    size: int
+    outputs: Any
+    static: Any
+    text: str
+
+    @property
+    def workers(self) -> int:
+        """How many chunks are computed at once.
+
+        Calls of LAPACK for batches, from programs that run at once on a CPU, may wait for each other for ever
+        (jaxlib 0.10: they wait for threads of the pool that they run in). linkax itself makes none in a batch.
+        """
+        if jax.default_backend() != "cpu":
+            return 2  # one is computed while the results of another are copied
+        return 1 if _calls_lapack(self.text) else _cores()
+
+    @staticmethod
+    def compiled(function, params, chunk, memory, devices) -> "_Program":
+        one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), params)
+        shape = eqx.filter_eval_shape(function, one)
+        is_struct = lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct)
+        static = eqx.partition(shape, is_struct)[1]
+        while True:
+            size = chunk * len(devices)
+            batch = jax.tree.map(lambda leaf, size=size: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), one)
+            with jax.default_device(devices[0]):
+                lowered = jax.jit(_spread(jax.vmap(_member(function)), devices)).lower(batch)
+                text = lowered.as_text()
+                if len(devices) > 1 and devices[0].platform == "cpu" and _calls_lapack(text):
+                    devices = devices[:1]
+                    continue
+                run = lowered.compile()
+            used = _memory(run)
+            if used <= memory or chunk == 1:
+                return _Program(run, size, lowered.out_info, static, text)
+            chunk = max(1, int(0.9 * chunk * memory / used))
+
+
+def _spread(mapped, devices):
+    """A function of a batch, each part of it on a device of its own that waits for no other."""
+    if len(devices) == 1:
+        return mapped
+    members = PartitionSpec("members")
+    mesh = Mesh(np.array(devices), ("members",))
+    return jax.shard_map(mapped, mesh=mesh, in_specs=(members,), out_specs=members, check_vma=False)
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def _calls_lapack(text) -> bool:
+    return "@lapack_" in text or "@blas_" in text
+
+
+def _memory(compiled) -> int:
+    """Bytes that a program takes on one device, as far as the compiler tells."""
+    found = compiled.memory_analysis()
+    if found is None:
+        return 0
+    return found.temp_size_in_bytes + found.argument_size_in_bytes + found.output_size_in_bytes
+
+
+def _run(program, params, order, kept, bar):
+    """Outputs and reasons in the order of running, the seconds that it took, and how many members ran."""
+    count = len(order)
+    starts = range(0, count, program.size)
+    own = starts[jax.process_index() :: jax.process_count()]
+    found = jax.tree.map(lambda info: np.zeros((count, *info.shape[1:]), info.dtype), program.outputs)
+    reasons = found[1]
+    reasons[:] = NOT_RUN
+    done = set() if kept is None else kept.load(found)
+    params = jax.tree.map(np.asarray, params)
+
+    def compute(start):
+        members = order[np.minimum(np.arange(start, start + program.size), count - 1)]
+        values = jax.tree.map(lambda leaf: leaf[members], params)
+        return start, jax.tree.map(np.asarray, program.run(values))
+
+    bar.update(sum(min(program.size, count - start) for start in done))
+    left = [start for start in own if start not in done]
+    began, ran = time.perf_counter(), 0
+    for start, computed in _in_parallel(compute, left, program.workers):
+        part = slice(start, min(start + program.size, count))
+        computed = jax.tree.map(lambda array, part=part: array[: part.stop - part.start], computed)
+        for whole, piece in zip(jax.tree.leaves(found), jax.tree.leaves(computed), strict=True):
+            whole[part] = piece
+        if kept is not None:
+            kept.save(start, part, computed)
+        ran += part.stop - part.start
+        bar.update(part.stop - part.start)
+        failed = int(np.sum(~np.isin(reasons[reasons != NOT_RUN], [REASONS.index(name) for name in FINE])))
+        bar.set_postfix(failed=failed)
+    elapsed = time.perf_counter() - began
+    if kept is not None and jax.process_count() > 1:
+        multihost_utils.sync_global_devices("sweep")
+    return found, elapsed, ran
+
+
+def _in_parallel(compute, items, workers):
+    """Results as they come, of so many threads; at most one chunk waits for each."""
+    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+        queue, running = iter(items), set()
+        while True:
+            running |= {pool.submit(compute, item) for item in itertools.islice(queue, 2 * workers - len(running))}
+            if not running:
+                return
+            finished, running = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
+            for future in finished:
+                yield future.result()
+
+
+def _gathered(found):
+    """What each process found, put together in all of them."""
+    own = found[1] != NOT_RUN
+    everyone = multihost_utils.process_allgather((found, own))
+    (arrays, reasons), by = everyone
+    whose = np.argmax(by, axis=0)
+    pick = lambda stacked: stacked[whose, np.arange(len(whose))]
+    return jax.tree.map(pick, arrays), pick(reasons)

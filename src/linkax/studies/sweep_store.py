@@ -1,0 +1,95 @@
+"""Results of a sweep on disk, as they come."""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import zarr
+
+FORMAT = 1
+
+
+class SweepStore(NamedTuple):
+    """A Zarr group: `member`, the members in the order of rows; `reason`; `output/…`, one array for each of the
+    function's; `params/…`; and `done`, one number for each chunk, set once all of it is written.
+    """
+
+    group: zarr.Group
+    arrays: tuple
+    size: int
+
+    @staticmethod
+    def opened(path, program, params, order) -> "SweepStore":
+        """A new store, or the one that is there.
+
+        **Raises:** `ValueError` where it holds another sweep.
+        """
+        path, count = Path(os.fspath(path)), len(order)
+        identity = dict(format=FORMAT, members=count, chunk=program.size, sweep=_identity(program, params, order))
+        first = jax.process_index() == 0
+        outputs, reason = program.outputs
+        names = ["reason", *_names("output", outputs)]
+        infos = [reason, *jax.tree.leaves(outputs)]
+        if first and not (path / "zarr.json").exists():
+            group = zarr.open_group(path, mode="w-" if not path.exists() else "a")
+            for name, info in zip(names, infos, strict=True):
+                shape = (count, *info.shape[1:])
+                group.create_array(name, shape=shape, chunks=(program.size, *info.shape[1:]), dtype=info.dtype)
+            for name, leaf in zip(_names("params", params), jax.tree.leaves(params), strict=True):
+                group.create_array(name, data=np.asarray(leaf))
+            group.create_array("member", data=order)
+            chunks = -(-count // program.size)
+            group.create_array("done", shape=(chunks,), chunks=(1,), dtype=np.int8, fill_value=0)
+            group.attrs.update(identity)
+        _wait()
+        group = zarr.open_group(path, mode="r+")
+        other = {name: group.attrs.get(name) for name in identity}
+        if other != identity:
+            differs = ", ".join(name for name in identity if other[name] != identity[name])
+            raise ValueError(
+                f"store {str(path)!r} holds another sweep: its {differs} differ (function, numbers in it, parameters, "
+                "chunk or versions have changed); give another folder, or remove this one"
+            )
+        return SweepStore(group, tuple(group[name] for name in names), program.size)
+
+    def load(self, found) -> set:
+        """Read what is there into (outputs, reasons); returns where the chunks begin that are done."""
+        outputs, reasons = found
+        starts = self.size * np.flatnonzero(self.group["done"][:])
+        for whole, array in zip([reasons, *jax.tree.leaves(outputs)], self.arrays, strict=True):
+            for start in starts:
+                part = slice(start, min(start + self.size, len(whole)))
+                whole[part] = array[part]
+        return {int(start) for start in starts}
+
+    def save(self, start, part, computed):
+        """Write a chunk, and then that it is done."""
+        outputs, reasons = computed
+        for array, piece in zip(self.arrays, [reasons, *jax.tree.leaves(outputs)], strict=True):
+            array[part] = piece
+        self.group["done"][start // self.size] = 1
+
+
+def _names(prefix, tree: Any) -> list[str]:
+    """Paths of a tree's leaves as names of arrays."""
+    paths = [path for path, _ in jax.tree.leaves_with_path(tree)]
+    name = lambda key: str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key))))
+    return ["/".join([prefix, *map(name, path)]) if path else f"{prefix}/value" for path in paths]
+
+
+def _identity(program, params, order) -> str:
+    digest = hashlib.sha256(program.text.encode())
+    for leaf in [*jax.tree.leaves(params), order]:
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def _wait():
+    """For the process that makes the store."""
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        multihost_utils.sync_global_devices("sweep store")

@@ -1,0 +1,131 @@
+"""Sweeps: every member once and exact, whatever happens to others, to the process, or to its share of the work."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import zarr
+from studies import sweep_job
+
+import linkax as lx
+
+JOB = Path(sweep_job.__file__)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The sweep in one go."""
+    return lx.sweep(sweep_job.swing, sweep_job.batch(), chunk=sweep_job.CHUNK)
+
+
+def started(*arguments, devices=1):
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+    environment = os.environ | {"PYTHONPATH": str(JOB.parent.parent), "XLA_FLAGS": flags}
+    return subprocess.Popen([sys.executable, str(JOB), *map(str, arguments)], env=environment, stderr=subprocess.PIPE)
+
+
+def finished(*processes):
+    for process in processes:
+        _, errors = process.communicate(timeout=240)
+        assert process.returncode == 0, errors.decode()[-3000:]
+
+
+def same(file, whole):
+    with np.load(file) as found:
+        np.testing.assert_array_equal(found["angle"], whole.output["angle"])
+        np.testing.assert_array_equal(found["reasons"], whole.reasons)
+
+
+def test_members_that_fail_are_marked_and_harm_no_other(whole):
+    assert whole.count() == {"successful": 118, "max_steps_reached": 1, "not_finite": 1}
+    assert list(whole.failed) == [3, 7]
+    assert "maximum number of" in whole.failed[7]
+    one = jax.jit(sweep_job.swing)
+    for member in (0, 55, 119):
+        alone = one(jax.tree.map(lambda leaf, member=member: leaf[member], sweep_job.batch()))
+        np.testing.assert_allclose(whole.output["angle"][member], alone["angle"], rtol=0.0, atol=1e-10)
+
+
+def test_killed_and_resumed(whole, tmp_path):
+    """SIGKILL after a few of sixty chunks: the others alone are run, and all are as they would have been."""
+    store, result = tmp_path / "store", tmp_path / "result.npz"
+    process = started(store, result)
+    deadline = time.monotonic() + 240.0
+    while len(list((store / "done").glob("c/*"))) < 2:
+        assert process.poll() is None, process.stderr.read().decode()[-3000:]
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    kept = zarr.open_group(store)["done"][:]
+    assert 2 <= np.sum(kept) < len(kept)
+    assert not result.exists()
+    finished(started(store, result))
+    same(result, whole)
+    np.testing.assert_array_equal(zarr.open_group(store)["output/angle"][:], whole.output["angle"])
+
+
+def test_two_processes(whole, tmp_path):
+    """They share the work over a loopback connection, and each returns the whole."""
+    with socket.socket() as listener:
+        listener.bind(("localhost", 0))
+        port = listener.getsockname()[1]
+    results = [tmp_path / f"{process}.npz" for process in range(2)]
+    finished(*(started(tmp_path / "store", result, process, 2, port) for process, result in enumerate(results)))
+    for result in results:
+        same(result, whole)
+
+
+def test_two_devices(whole, tmp_path):
+    result = tmp_path / "result.npz"
+    finished(started("-", result, devices=2))
+    same(result, whole)
+
+
+def test_store_of_another_sweep(tmp_path):
+    numbers = jnp.arange(5.0)
+    lx.sweep(jnp.sin, numbers, store=tmp_path)
+    again = lx.sweep(jnp.sin, numbers, store=tmp_path)
+    np.testing.assert_array_equal(again.output, np.sin(numbers))
+    assert np.isnan(again.seconds_per_member)
+    for function, params in ((jnp.cos, numbers), (jnp.sin, numbers + 1.0)):
+        with pytest.raises(ValueError, match="holds another sweep"):
+            lx.sweep(function, params, store=tmp_path)
+
+
+def test_difficulty_sorts_and_results_come_back_in_order():
+    numbers = jnp.array([3.0, 1.0, jnp.nan, 2.0, 5.0])
+    for difficulty in (lambda x: x, np.arange(5)):
+        found = lx.sweep(lambda x: x**2, numbers, chunk=2, difficulty=difficulty)
+        np.testing.assert_array_equal(found.output, np.asarray(numbers) ** 2)
+        assert found.count() == {"successful": 4, "not_finite_output": 1}
+
+
+def test_chunks_shrink_to_the_memory():
+    """Each member needs a megabyte: four at once, not twenty."""
+    sizes = []
+
+    def heavy(x):
+        return jnp.sum(jnp.linalg.inv(jnp.eye(360) + x * jnp.sin(jnp.arange(360.0**2).reshape(360, 360))))
+
+    found = lx.sweep(lambda x: sizes.append(x) or heavy(x), jnp.linspace(0.0, 0.1, 20), memory=2**23)
+    assert found.output.shape == (20,)
+    assert found.ok.all()
+    assert len(sizes) > 2  # compiled again, smaller
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="same leading axis"):
+        lx.sweep(lambda p: p["a"], {"a": jnp.zeros(3), "b": jnp.zeros(4)})
+    with pytest.raises(ValueError, match="one number for each of 3"):
+        lx.sweep(jnp.sin, jnp.zeros(3), difficulty=np.zeros(2))
+    with pytest.raises(ValueError, match="chunk is 0"):
+        lx.sweep(jnp.sin, jnp.zeros(3), chunk=0)
