@@ -60,7 +60,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
-    raised: the speeds are not numbers then, and `linkax.simulate` says so in its result.
+    raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
     """
     positions, guess = (
         coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess"))
@@ -71,7 +71,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
     state, remainder = _assemble(mechanism, positions, speeds, guess, jnp.asarray(t, float))
     if known(state.q) is None:
-        return State(state.q, jnp.where(remainder.is_met(), state.v, jnp.nan))
+        return State(state.q, jnp.where(remainder.is_met(), state.v, jnp.inf))
     _raise_if_open(mechanism, state, t, jax.tree.map(np.asarray, remainder))
     return state
 

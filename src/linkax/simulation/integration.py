@@ -23,7 +23,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.state import State
 
-NOISE_ULPS = 1.0
+NOISE_ULPS = 12.0  # in an error estimate. Less would let rounding choose the first steps, batches unlike single runs
 FIRST_STEP = 1e-3  # of the whole time
 FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 SMALLEST_STEP_ULPS = 4.0
@@ -252,7 +252,9 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         scaled = None
         if y_error.error is not None:
             noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.nearest)
-            scaled = tuple(_less(e / units, noise * scale) for e, scale in zip(y_error.error, scales[0], strict=True))
+            # The second is none where the step has led to no numbers.
+            largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), *scales)
+            scaled = tuple(_less(e / units, noise * scale) for e, scale in zip(y_error.error, largest, strict=True))
         before, retries = controller_state
         keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
             t0, t1, *scales, args, scaled, error_order, before
@@ -290,7 +292,7 @@ def _noise(distance, nearest):
 
     Across the motion it grows like 1/d², but that the correction takes off.
     """
-    return NOISE_ULPS * jnp.finfo(distance.dtype).eps / jnp.maximum(distance, nearest)
+    return (NOISE_ULPS + 1.0 / jnp.maximum(distance, nearest)) * jnp.finfo(distance.dtype).eps
 
 
 def _less(error, noise):

@@ -24,7 +24,7 @@ class Outset(NamedTuple):
     """A state that motion starts from, put on the closed loops.
 
     - `rank`: of J at the states next to it along the motion, for each island of the mechanism.
-    - `assembled`: not marked by `linkax.assemble`, by speeds that are no numbers, as a state that it did not find.
+    - `assembled`: not marked by `linkax.assemble`, by infinite speeds, as a state that it did not find.
     - `finite`, `closed`; `massive`: all that can move has mass; `on_branch`: the speeds lie on a
       branch of the motion; `unique`: so does, at rest, the acceleration.
     """
@@ -59,7 +59,7 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     crossing, mass, acceleration, definiteness = method.departure(system, t, q)
     eps = jnp.finfo(system.dtype).eps
     massive = definiteness > SINGULAR_ULPS * eps * len(v)
-    assembled = jnp.logical_not(jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isnan(state.v)) & (len(state.v) > 0))
+    assembled = jnp.logical_not(jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isposinf(state.v)) & (len(state.v) > 0))
     finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & jnp.all(jnp.isfinite(mass))
     finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, acceleration, 0.0)))
     if system.topology.num_rows == 0:

@@ -1,0 +1,446 @@
+"""Parameters from measurements, by gradients, and how sure they are."""
+
+import json
+import os
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import scipy.stats
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+from tqdm import tqdm
+
+from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.simulation.files import written_whole
+from linkax.studies.parameters import AbstractParameter
+
+DEFAULT_STEPS = {"residual": 100, "loss": 1000}
+DEFAULT_TOLERANCE = 1e-6
+DEFAULT_RATE = 0.02  # of Adam, in parameters that all start near one
+FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
+NO_INFLUENCE = 1e-10  # of a parameter, relative to that of the most influential
+DEPENDENT = 1e-6  # smallest to largest diagonal of R
+INVOLVED = 1e-3  # share of a parameter in a change that the data do not see
+
+
+class Fit(NamedTuple):
+    """What a fit found.
+
+    - `params`: in the structure that was given, numbers in place of `Positive` and its like.
+    - `loss`: the loss, or half the sum of squares of the residual. `residual`: at the end, (n,), or None.
+    - `names`: of the p numbers in `params`, in the order of `covariance`.
+    - `covariance`: of these numbers, (p, p), from the sensitivities of the residual and its own size; infinite for
+      what the data do not determine; None for a loss. `noise`: standard deviation of the residual.
+    - `undetermined`: names of numbers that the data do not determine.
+    - `history`: {"loss": at each step}. `steps`: taken.
+    - `ended`: "converged", "stopped early", "diverged", or "out of steps".
+    """
+
+    params: Any
+    loss: float
+    residual: np.ndarray | None
+    names: list[str]
+    covariance: np.ndarray | None
+    noise: float | None
+    undetermined: list[str]
+    history: dict[str, np.ndarray]
+    steps: int
+    ended: str
+    spread: Callable
+
+    @property
+    def standard_errors(self):
+        """Standard deviation of each number, in the structure of `params`."""
+        _, unravel = ravel_pytree(self.params)
+        return jax.tree.map(np.asarray, unravel(jnp.sqrt(jnp.diagonal(self._known_covariance()))))
+
+    def interval(self, level=0.95):
+        """Lower and upper ends of the confidence intervals of all numbers, each in the structure of `params`.
+
+        From Student's t distribution. They keep to the bounds of `Positive` and `Bounded`.
+        """
+        self._known_covariance()
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"level is {level!r}; it must lie between 0 and 1, such as 0.95")
+        freedom = max(len(self.residual) - len(self.names), 1)
+        return self.spread(float(scipy.stats.t.ppf(0.5 + level / 2.0, freedom)))
+
+    def _known_covariance(self):
+        if self.covariance is None:
+            raise ValueError("a loss has no covariance: fit a residual, whose sum of squares is the loss")
+        return self.covariance
+
+
+def fit(
+    function: Callable,
+    params: Any,
+    args: tuple = (),
+    *,
+    optimiser: Any = None,
+    steps: int | None = None,
+    tolerance: float = DEFAULT_TOLERANCE,
+    patience: int | None = None,
+    mode: str | None = None,
+    checkpoint: str | os.PathLike | None = None,
+    progress: bool | None = None,
+) -> Fit:
+    """Find the parameters that make a residual or a loss smallest.
+
+    **Arguments:**
+
+    - `function`: (params, *args) -> a residual, arrays in any pytree whose sum of squares is to be smallest; or a
+      loss, one number. A residual divided by the standard deviation of its noise counts every measurement for what
+      it is worth. Several experiments are several parts of a residual, unknown initial states are parameters.
+    - `params`: pytree of numbers and arrays, where the fit starts; `Positive`, `Bounded` and `PhysicalInertia` among
+      them keep to what makes sense. Numbers are fitted in units of their own start.
+    - `args`: what else the function gets, measurements above all: other ones of the same shapes compile nothing anew.
+    - `optimiser`: for a residual an optimistix least-squares solver, default `optimistix.LevenbergMarquardt`; for
+      either one of optax, default for a loss `optax.adam`.
+    - `steps`: at most so many; default 100 for a residual, 1000 for a loss.
+    - `tolerance`: of parameters and residual, relative, at which Levenberg-Marquardt ends; of the loss, relative, that
+      a step of optax must gain to count as one that gains.
+    - `patience`: end after so many steps that gain nothing; default never for optax.
+    - `mode`: "forward" or "reverse", for derivatives; default by the number of parameters. A residual uses forward
+      mode.
+    - `checkpoint`: a file, written at each step, from which a fit that was killed goes on.
+    - `progress`: show a bar; default: where someone watches.
+
+    **Returns:** a `Fit`.
+
+    **Raises:** `ValueError` for parameters that are no numbers, for a function that is not finite where the fit
+    starts, and for a checkpoint of another fit.
+
+    **Warns:** of parameters that the data do not determine.
+    """
+    free = _Free.of(params)
+    args = jax.tree.map(jnp.asarray, tuple(args))
+    shape = eqx.filter_eval_shape(lambda z, args: function(free.params(z), *args), free.start, args)
+    is_loss = isinstance(shape, jax.ShapeDtypeStruct) and shape.shape == ()
+    kind = "loss" if is_loss else "residual"
+    if mode not in (None, "forward", "reverse"):
+        raise ValueError(f"mode is {mode!r}; give 'forward', 'reverse', or None")
+    if optimiser is None:
+        optimiser = optax.adam(DEFAULT_RATE) if is_loss else optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    by_squares = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
+    if by_squares and is_loss:
+        raise ValueError("least squares need a residual; this function returns one number, so give an optax optimiser")
+    search = (_Squares if by_squares else _Descent)(optimiser, function, free, mode)
+    steps = DEFAULT_STEPS[kind] if steps is None else steps
+    z, losses, ended = _search(search, args, steps, tolerance, patience, checkpoint, progress)
+    params = jax.tree.map(np.asarray, free.params(z))
+    history = {"loss": np.array(losses)}
+    if is_loss:
+        return Fit(params, min(losses), None, free.names, None, None, [], history, len(losses) - 1, ended, None)
+    residual, slopes = (np.asarray(part) for part in _sensitivity(search, z, args))
+    uncertainty = _uncertainty(residual, slopes, free, z)
+    if uncertainty.undetermined:
+        warnings.warn(
+            f"the data do not determine {', '.join(map(repr, uncertainty.undetermined))}: a change of "
+            f"{'it' if len(uncertainty.undetermined) == 1 else 'them together'} leaves the residual as it is; fix "
+            "some, or measure what they act on",
+            stacklevel=2,
+        )
+    return Fit(
+        params,
+        float(0.5 * residual @ residual),
+        residual,
+        free.names,
+        uncertainty.covariance,
+        uncertainty.noise,
+        uncertainty.undetermined,
+        history,
+        len(losses) - 1,
+        ended,
+        uncertainty.spread,
+    )
+
+
+def _is_parameter(node):
+    return isinstance(node, AbstractParameter)
+
+
+class _Free(eqx.Module):
+    """Parameters as functions of a vector z without bounds, whose entries for plain numbers all start near one.
+
+    - `leaves`: numbers, arrays, and parameters that are functions; `structure`: of the tree that they are leaves of.
+    - `scales`: of the free numbers of each leaf.
+    """
+
+    leaves: list
+    scales: list
+    structure: Any = eqx.field(static=True)
+    names: list[str] = eqx.field(static=True)
+
+    @staticmethod
+    def of(params) -> "_Free":
+        leaves, structure = jax.tree.flatten(params, is_leaf=_is_parameter)
+        if not leaves:
+            raise ValueError(f"params are {params!r}; give at least one number to fit")
+        paths = [path for path, _ in jax.tree.leaves_with_path(params, is_leaf=_is_parameter)]
+        names = []
+        for path, leaf in zip(paths, leaves, strict=True):
+            _check(path, leaf)
+            for inner, part in jax.tree.leaves_with_path(leaf.value if _is_parameter(leaf) else leaf):
+                names += _names((*path, *inner), jnp.shape(part))
+        leaves = [leaf if _is_parameter(leaf) else jnp.asarray(leaf, float) for leaf in leaves]
+        scales = [jnp.ones_like(leaf.free) if _is_parameter(leaf) else _magnitudes(leaf) for leaf in leaves]
+        return _Free(leaves, scales, structure, names)
+
+    def _starts(self):
+        free = [leaf.free if _is_parameter(leaf) else leaf for leaf in self.leaves]
+        return [value / scale for value, scale in zip(free, self.scales, strict=True)]
+
+    @property
+    def start(self) -> Float[Array, " p"]:
+        """z where the fit starts."""
+        return ravel_pytree(self._starts())[0]
+
+    def params(self, z):
+        """What the user's function gets."""
+        values = [part * scale for part, scale in zip(ravel_pytree(self._starts())[1](z), self.scales, strict=True)]
+        found = [leaf.value_of(x) if _is_parameter(leaf) else x for leaf, x in zip(self.leaves, values, strict=True)]
+        return jax.tree.unflatten(self.structure, found)
+
+    def vector(self, z):
+        """All numbers of `params`."""
+        return ravel_pytree(self.params(z))[0]
+
+    @property
+    def apart(self) -> np.ndarray:
+        """For each of these numbers, whether it is a rising function of one entry of z alone."""
+        sizes = [
+            (sum(jnp.size(x) for x in jax.tree.leaves(getattr(leaf, "value", leaf))), scale.size)
+            for leaf, scale in zip(self.leaves, self.scales, strict=True)
+        ]
+        return np.concatenate([np.full(numbers, numbers == free) for numbers, free in sizes])
+
+
+def _magnitudes(values):
+    return jnp.where(values == 0.0, 1.0, jnp.abs(values))
+
+
+def _check(path, leaf):
+    if _is_parameter(leaf):
+        return
+    try:
+        finite = np.all(np.isfinite(np.asarray(leaf, dtype=float)))
+    except (TypeError, ValueError) as error:
+        name = _names(path, ())[0]
+        raise ValueError(f"parameter {name!r} is {leaf!r}; give numbers, or Positive, Bounded, ... of them") from error
+    if not finite:
+        raise ValueError(f"parameter {_names(path, ())[0]!r} is {leaf!r}; it must be finite")
+
+
+def _names(path, shape) -> list[str]:
+    key = lambda part: str(getattr(part, "key", getattr(part, "name", getattr(part, "idx", part))))
+    name = ".".join(map(key, path)) or "value"
+    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]
+
+
+def _linearised(function, z):
+    """A function's value and its Jacobian, forwards."""
+    value, along = jax.linearize(function, z)
+    return value, jax.vmap(along, out_axes=-1)(jnp.eye(len(z), dtype=z.dtype))
+
+
+class _AbstractSearch(eqx.Module):
+    """Steps towards the smallest loss."""
+
+    solver: Any
+    function: Callable
+    free: _Free
+    mode: str | None = eqx.field(static=True)
+
+    def flat(self, z, args):
+        """The residual, or the loss, as a vector."""
+        return ravel_pytree(self.function(self.free.params(z), *args))[0]
+
+
+@eqx.filter_jit
+def _sensitivity(search, z, args):
+    return _linearised(lambda z: search.flat(z, args), z)
+
+
+class _Squares(_AbstractSearch):
+    """Steps of an optimistix least-squares solver."""
+
+    def _residual(self):
+        """With the Jacobian by forward mode as its reverse rule: so the solver keeps an array from step to step."""
+        if self.mode == "reverse":
+            return lambda z, args: (self.flat(z, args), None)
+
+        def residual(z, args):
+            flat = jax.custom_vjp(lambda z: self.flat(z, args))
+            flat.defvjp(lambda z: _linearised(lambda z: self.flat(z, args), z), lambda slopes, along: (along @ slopes,))
+            return flat(z), None
+
+        return residual
+
+    def begin(self, z, args):
+        shape = jax.eval_shape(self.flat, z, args)
+        return self.solver.init(self._residual(), z, args, {"jac": "bwd"}, shape, None, frozenset())
+
+    def step(self, z, state, args):
+        """The next z and state, the loss at z, and whether z is the answer."""
+        z, state, _ = self.solver.step(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
+        done, _ = self.solver.terminate(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
+        return z, state, 0.5 * jnp.sum(state.f_info.residual**2), done
+
+
+class _Descent(_AbstractSearch):
+    """Steps of an optax optimiser."""
+
+    def begin(self, z, args):
+        return self.solver.init(z)
+
+    def step(self, z, state, args):
+        """The next z and state, the loss at the last z, and False."""
+
+        def loss(z):
+            value = self.flat(z, args)
+            return value[0] if value.shape == (1,) else 0.5 * jnp.sum(value**2)
+
+        forward = len(z) <= FEW if self.mode is None else self.mode == "forward"
+        value, slope = _linearised(loss, z) if forward else jax.value_and_grad(loss)(z)
+        solver = optax.with_extra_args_support(self.solver)
+        update, state = solver.update(slope, state, z, value=value, grad=slope, value_fn=loss)
+        return optax.apply_updates(z, update), state, value, jnp.zeros((), bool)
+
+
+@eqx.filter_jit
+def _begin(search, z, args):
+    return search.begin(z, args)
+
+
+@eqx.filter_jit
+def _step(search, z, state, args):
+    return search.step(z, state, args)
+
+
+def _search(search, args, steps, tolerance, patience, checkpoint, progress):
+    """The best z, the loss at each step, and how the search ended."""
+    z = search.free.start
+    state = _begin(search, z, args)
+    losses, best, best_z, waited = [], np.inf, z, 0
+    kept = None if checkpoint is None else _Checkpoint(Path(os.fspath(checkpoint)), search.free.names)
+    if kept is not None and kept.path.exists():
+        (z, best_z, state), losses = kept.load((z, best_z, state))
+        best = min(losses)
+    ended = "out of steps"
+    with tqdm(total=steps, initial=len(losses), desc="compiling", unit="step", disable=_hides(progress)) as bar:
+        while len(losses) < steps + 1:
+            before = z
+            z, state, loss, done = _step(search, z, state, args)
+            loss = float(loss)
+            if not losses and not np.isfinite(loss):
+                raise ValueError(
+                    "the function is not finite at the parameters where the fit starts: look at solution.result of a "
+                    "single run with them"
+                )
+            losses.append(loss)
+            # Squares tell the loss at z, descent that at the point before.
+            here = z if isinstance(search, _Squares) else before
+            waited = 0 if loss < best * (1.0 - tolerance) or not np.isfinite(best) else waited + 1
+            best, best_z = (loss, here) if loss <= best else (best, best_z)
+            bar.set_description("fitting")
+            bar.set_postfix(loss=f"{loss:.6g}")
+            bar.update()
+            if kept is not None:
+                kept.save((z, best_z, state), losses)
+            if done:
+                ended = "converged"
+                break
+            if not np.isfinite(loss):
+                ended = "diverged"
+                break
+            if patience is not None and waited >= patience:
+                ended = "stopped early"
+                break
+    return best_z, losses, ended
+
+
+def _hides(progress):
+    return None if progress is None else not progress
+
+
+class _Checkpoint(NamedTuple):
+    """A file of all that a search goes on from."""
+
+    path: Path
+    names: list[str]
+
+    def save(self, tree, losses):
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))]
+        with written_whole(self.path) as file, open(file, "wb") as stream:
+            header = json.dumps({"names": self.names, "losses": losses})
+            np.savez(stream, header=np.array(header), **{f"leaf_{i}": leaf for i, leaf in enumerate(leaves)})
+
+    def load(self, like):
+        arrays, static = eqx.partition(like, eqx.is_array)
+        leaves, structure = jax.tree.flatten(arrays)
+        with np.load(self.path) as file:
+            header = json.loads(str(file["header"]))
+            found = [file[f"leaf_{i}"] for i in range(len(file.files) - 1)]
+        same = header["names"] == self.names and [x.shape for x in found] == [jnp.shape(x) for x in leaves]
+        if not same:
+            raise ValueError(
+                f"checkpoint {str(self.path)!r} holds another fit, of {', '.join(header['names'])}; give another file, "
+                "or remove this one"
+            )
+        found = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(found, leaves, strict=True)]
+        return eqx.combine(jax.tree.unflatten(structure, found), static), header["losses"]
+
+
+class _Uncertainty(NamedTuple):
+    covariance: np.ndarray
+    noise: float
+    undetermined: list[str]
+    spread: Callable
+
+
+def _uncertainty(residual, slopes, free, z) -> _Uncertainty:
+    """Covariance of the parameters from the sensitivities (n, p) of the residual, by their column-pivoted QR."""
+    count, size = slopes.shape
+    norms = np.linalg.norm(slopes, axis=0)
+    matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
+    scale = np.where(matters, norms, 1.0)
+    square = np.linalg.qr(np.where(matters, slopes / scale, 0.0), mode="r")
+    _, r, order = (np.asarray(part) for part in pivoted_qr(jnp.asarray(square)))
+    diagonal = np.abs(np.diagonal(r))
+    rank = int(np.sum(diagonal > DEPENDENT * max(diagonal[0], np.finfo(float).tiny)))
+    to_free = np.zeros((size, size))
+    inverse = np.linalg.inv(r[:rank, :rank]) if rank else np.zeros((0, 0))
+    rows = order[:rank]
+    to_free[np.ix_(rows, rows)] = inverse @ inverse.T / np.outer(scale[rows], scale[rows])
+    noise = float(np.sqrt(residual @ residual / max(count - rank, 1)))
+    # Changes that the residual does not see: of one parameter that is left over, and what makes up for it.
+    unseen = np.zeros((size, size - rank))
+    unseen[order[:rank]] = -inverse @ r[:rank, rank:]
+    unseen[order[rank:]] = np.eye(size - rank)
+    lost = np.any(np.abs(unseen) > INVOLVED, axis=1)
+    slopes_of_params = np.asarray(jax.jacfwd(free.vector)(z))
+    covariance = noise**2 * slopes_of_params @ to_free @ slopes_of_params.T
+    undetermined = np.any(np.abs(slopes_of_params[:, lost]) > 0.0, axis=1)
+    covariance[undetermined, undetermined] = np.inf
+    deviation = noise * np.sqrt(np.where(lost, np.inf, np.diagonal(to_free)))
+    _, unravel = ravel_pytree(free.params(z))
+
+    def spread(times):
+        """Ends of intervals of so many standard deviations."""
+        ends = []
+        for sign in (-1.0, 1.0):
+            linear = np.asarray(free.vector(z)) + sign * times * np.sqrt(np.diagonal(covariance))
+            moved = np.asarray(free.vector(z + sign * times * deviation))
+            ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(np.where(free.apart, moved, linear)))))
+        return tuple(ends)
+
+    names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
+    return _Uncertainty(covariance, noise, names, spread)

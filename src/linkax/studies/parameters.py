@@ -1,0 +1,133 @@
+"""Parameters of a fit that stay where they make sense, by what they are functions of."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from linkax.model.numbers import known, number
+
+
+class AbstractParameter(eqx.Module):
+    """A parameter as a function of numbers that may take any value."""
+
+    @property
+    @abc.abstractmethod
+    def free(self) -> Float[Array, "..."]:
+        """The numbers of which the parameter is a function, at its value."""
+
+    @abc.abstractmethod
+    def value_of(self, free):
+        """The parameter at other such numbers."""
+
+
+class Positive(AbstractParameter):
+    """Numbers that stay positive: fitted by their logarithm. `value`: where the fit starts, any shape."""
+
+    value: Float[Array, "..."]
+
+    def __init__(self, value):
+        self.value = _checked("Positive", value, lambda value: value > 0.0, "must be positive")
+
+    @property
+    def free(self):
+        return jnp.log(self.value)
+
+    def value_of(self, free):
+        return jnp.exp(free)
+
+
+class Bounded(AbstractParameter):
+    """Numbers that stay between two bounds. `value`: where the fit starts, between them, any shape."""
+
+    value: Float[Array, "..."]
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
+
+    def __init__(self, value, lower, upper):
+        self.lower, self.upper = (number(bound, (), "Bounded: bound") for bound in (lower, upper))
+        inside = lambda value: (value > float(lower)) & (value < float(upper))
+        self.value = _checked("Bounded", value, inside, f"must lie between {lower} and {upper}")
+
+    @property
+    def free(self):
+        return jax.scipy.special.logit((self.value - self.lower) / (self.upper - self.lower))
+
+    def value_of(self, free):
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(free)
+
+
+class Inertia(NamedTuple):
+    """Mass [kg], centre of mass [m], (3,), and inertia tensor about it [kg m²], (3, 3), as `RigidBody` takes them."""
+
+    mass: Float[Array, ""]
+    center_of_mass: Float[Array, "3"]
+    inertia: Float[Array, "3 3"]
+
+
+class PhysicalInertia(AbstractParameter):
+    """The inertia of a body that can exist: some distribution of positive mass has it.
+
+    Fitted by the ten numbers of Rucker and Wensing, Smooth parameterization of rigid-body inertia, IEEE Robotics and
+    Automation Letters 7(2), 2022: the pseudo-inertia matrix is U Uᵀ, U upper triangular with a positive diagonal. The
+    function that is fitted gets an `Inertia`.
+
+    **Arguments:** `mass`, `center_of_mass`, `inertia` as in `linkax.RigidBody`, where the fit starts: of a body with
+    extent along all axes.
+    """
+
+    value: Inertia
+
+    def __init__(self, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(1.0, 1.0, 1.0)):
+        inertia = np.asarray(inertia, dtype=float)
+        tensor = np.diag(inertia) if inertia.ndim == 1 else inertia
+        self.value = Inertia(
+            number(mass, (), "PhysicalInertia: mass [kg]"),
+            number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]"),
+            number(tensor, (3, 3), "PhysicalInertia: inertia [kg m²]"),
+        )
+        smallest = np.min(np.linalg.eigvalsh(_pseudo_inertia(*self.value)))
+        if not smallest > 0.0:
+            raise ValueError(
+                f"PhysicalInertia: no body with extent along all axes has mass {mass} kg and inertia {tensor.tolist()} "
+                "kg m²; all principal moments must be positive, and each smaller than the sum of the other two"
+            )
+
+    @property
+    def free(self):
+        # U Uᵀ from the Cholesky factor of the matrix with its rows and columns the other way round.
+        upper = np.linalg.cholesky(_pseudo_inertia(*self.value)[::-1, ::-1])[::-1, ::-1]
+        size = upper[3, 3]
+        u = upper / size
+        return jnp.array([np.log(size), *np.log(np.diagonal(u)[:3]), u[0, 1], u[1, 2], u[0, 2], *u[:3, 3]])
+
+    def value_of(self, free):
+        size, *rest = free
+        d1, d2, d3, s12, s23, s13, t1, t2, t3 = rest
+        zero, one = jnp.zeros_like(size), jnp.ones_like(size)
+        rows = [[jnp.exp(d1), s12, s13, t1], [zero, jnp.exp(d2), s23, t2], [zero, zero, jnp.exp(d3), t3]]
+        u = jnp.exp(size) * jnp.array([*rows, [zero, zero, zero, one]])
+        pseudo = u @ u.T
+        mass, first = pseudo[3, 3], pseudo[:3, 3]
+        center = first / mass
+        second = pseudo[:3, :3] - mass * jnp.outer(center, center)
+        return Inertia(mass, center, jnp.trace(second) * jnp.eye(3) - second)
+
+
+def _pseudo_inertia(mass, center, inertia):
+    """[[∫ r rᵀ dm, ∫ r dm], [∫ rᵀ dm, m]] about the origin of the body, (4, 4)."""
+    second = 0.5 * np.trace(inertia) * np.eye(3) - inertia + mass * np.outer(center, center)
+    first = mass * np.asarray(center)[:, None]
+    return np.block([[second, first], [first.T, np.reshape(mass, (1, 1))]])
+
+
+def _checked(kind, value, condition, remedy):
+    array = jnp.asarray(value, dtype=float)
+    concrete = known(array)
+    if concrete is not None and not np.all(condition(concrete)):
+        raise ValueError(f"{kind}: value is {concrete.tolist()}; it {remedy}")
+    return array

@@ -1,0 +1,167 @@
+"""Fits: known parameters found again, their uncertainty right, and what cannot be found named."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+
+import linkax as lx
+
+TIMES = np.linspace(0.0, 4.0, 60)
+
+
+def decay(params):
+    return params["size"] * jnp.exp(-params["rate"] * TIMES)
+
+
+TRUTH = {"size": 3.0, "rate": 0.7}
+START = {"size": 1.0, "rate": 2.0}
+
+
+def measured(seed, noise=0.05):
+    return decay(TRUTH) + noise * np.random.default_rng(seed).normal(size=TIMES.shape)
+
+
+def apart(params, data):
+    return decay(params) - data
+
+
+SOLVERS = [optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9), optx.GaussNewton(rtol=1e-9, atol=1e-9), optax.adam(0.05)]
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_every_optimiser_finds_the_least_squares(solver):
+    start = {"size": 2.0, "rate": 1.0}
+    found = lx.fit(apart, start, (measured(0),), optimiser=solver, steps=3000, patience=200)
+    best = lx.fit(apart, TRUTH, (measured(0),), tolerance=1e-9)
+    for name in TRUTH:
+        np.testing.assert_allclose(found.params[name], best.params[name], rtol=1e-5)
+    np.testing.assert_allclose(found.loss, best.loss, rtol=1e-9)
+    assert found.ended != "out of steps"
+    assert len(found.history["loss"]) == found.steps + 1
+
+
+def test_covariance_and_intervals_are_those_of_linear_regression():
+    """Against the textbook, of a straight line."""
+    data = 1.0 + 0.5 * TIMES + 0.1 * np.random.default_rng(3).normal(size=TIMES.shape)
+    found = lx.fit(lambda p: p["at_zero"] + p["slope"] * TIMES - data, {"slope": 1.0, "at_zero": 2.0})
+    assert found.names == ["at_zero", "slope"]
+    rows = np.stack([np.ones_like(TIMES), TIMES], axis=1)
+    best, left, *_ = np.linalg.lstsq(rows, data, rcond=None)
+    covariance = left[0] / (len(TIMES) - 2) * np.linalg.inv(rows.T @ rows)
+    np.testing.assert_allclose([found.params["at_zero"], found.params["slope"]], best, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8)
+    lower, upper = found.interval(0.95)
+    np.testing.assert_allclose(upper["slope"] - lower["slope"], 2 * 2.0017 * np.sqrt(covariance[1, 1]), rtol=1e-4)
+    np.testing.assert_allclose(found.standard_errors["slope"], np.sqrt(covariance[1, 1]), rtol=1e-8)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    held = 0
+    for seed in range(100):
+        lower, upper = lx.fit(apart, {"size": 2.5, "rate": lx.Positive(0.9)}, (measured(seed),)).interval()
+        held += sum(lower[name] < TRUTH[name] < upper[name] for name in TRUTH)
+    assert 180 <= held <= 199  # of 200, at 95 %
+
+
+def test_what_the_data_do_not_determine_is_named():
+    """Two factors of which only the product matters, and a number that does nothing."""
+    data = measured(1)
+
+    def residual(p):
+        return p["a"] * p["b"] * jnp.exp(-p["rate"] * TIMES) + 0.0 * p["idle"] - data
+
+    with pytest.warns(UserWarning, match="do not determine 'a', 'b', 'idle'"):
+        found = lx.fit(residual, {"a": 1.0, "b": 2.0, "idle": 1.0, "rate": 1.0})
+    assert found.undetermined == ["a", "b", "idle"]
+    errors = found.standard_errors
+    assert np.isinf(errors["a"])
+    assert np.isinf(errors["idle"])
+    np.testing.assert_allclose(
+        errors["rate"], lx.fit(lambda p: decay(p) - data, START).standard_errors["rate"], rtol=1e-5
+    )
+
+
+def test_bounds_hold():
+    found = lx.fit(
+        lambda p: jnp.stack([p["x"] - 5.0, p["y"] + 1.0]), {"x": lx.Bounded(0.5, 0, 2), "y": lx.Positive(1.0)}
+    )
+    assert 1.9 < found.params["x"] < 2.0
+    assert 0.0 < found.params["y"] < 0.1
+
+
+def test_physical_inertia_is_that_of_a_body():
+    inertia = np.array([[0.5, 0.1, 0.0], [0.1, 0.6, -0.05], [0.0, -0.05, 0.7]])
+    parameter = lx.PhysicalInertia(2.0, [0.1, -0.2, 0.3], inertia)
+    back = parameter.value_of(parameter.free)
+    for found, given in zip(back, (2.0, [0.1, -0.2, 0.3], inertia), strict=True):
+        np.testing.assert_allclose(found, given, rtol=1e-12, atol=1e-15)
+    for seed in range(20):
+        mass, _, tensor = parameter.value_of(jnp.asarray(np.random.default_rng(seed).normal(size=10)))
+        moments = np.linalg.eigvalsh(tensor)
+        assert mass > 0.0
+        assert moments[0] > 0.0
+        assert moments[2] <= (moments[0] + moments[1]) * (1.0 + 1e-9)
+    with pytest.raises(ValueError, match="no body with extent"):
+        lx.PhysicalInertia(1.0, inertia=[1.0, 1.0, 3.0])
+
+
+def test_killed_and_resumed(tmp_path):
+    """A fit that stops after three steps goes on from there, to the same numbers by the same steps."""
+    args, file = (measured(2),), tmp_path / "fit.npz"
+    whole = lx.fit(apart, START, args)
+    part = lx.fit(apart, START, args, steps=3, checkpoint=file)
+    assert part.ended == "out of steps"
+    rest = lx.fit(apart, START, args, checkpoint=file)
+    np.testing.assert_array_equal(rest.history["loss"], whole.history["loss"])
+    assert rest.params == whole.params
+    with pytest.raises(ValueError, match="holds another fit"):
+        lx.fit(lambda p: decay({"size": p["x"], "rate": 1.0}), {"x": 1.0}, checkpoint=file)
+
+
+def test_loss_by_gradients_of_either_mode():
+    loss = lambda p: jnp.sum((p["x"] - jnp.arange(5.0)) ** 2) + (p["y"] - 2.0) ** 2
+    for mode in ("forward", "reverse", None):
+        found = lx.fit(loss, {"x": jnp.ones(5), "y": 1.0}, optimiser=optax.lbfgs(), steps=50, mode=mode, patience=5)
+        np.testing.assert_allclose(found.params["x"], np.arange(5.0), atol=1e-6)
+    with pytest.raises(ValueError, match="fit a residual"):
+        found.interval()
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="parameter 'a' is 'one'"):
+        lx.fit(lambda p: p["a"], {"a": "one"})
+    with pytest.raises(ValueError, match="parameter 'a' is nan"):
+        lx.fit(lambda p: p["a"], {"a": np.nan})
+    with pytest.raises(ValueError, match="not finite at the parameters"):
+        lx.fit(lambda p: jnp.log(p["a"] - jnp.arange(3.0)), {"a": 0.0})
+    with pytest.raises(ValueError, match="must be positive"):
+        lx.Positive(-1.0)
+    with pytest.raises(ValueError, match="least squares need a residual"):
+        lx.fit(lambda p: p["a"] ** 2, {"a": 1.0}, optimiser=optx.LevenbergMarquardt(1e-6, 1e-6))
+
+
+def test_experiments_with_their_own_initial_states():
+    """A pendulum's length and damping from three swings, the angles at which they began unknown."""
+    hinge = lambda arm: lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
+
+    def angles(params, start):
+        arm = lx.rod("arm", length=params["length"], mass=1.0)
+        forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointDamper("hinge", params["damping"])]
+        mechanism = lx.Mechanism([arm], [hinge(arm)], forces)
+        state = lx.State(jnp.reshape(start, 1), jnp.zeros(1))
+        return lx.simulate(mechanism, state, t1=2.0).joint("hinge")
+
+    every = jax.vmap(angles, in_axes=(None, 0))
+    truth = {"length": 0.8, "damping": 0.05, "starts": jnp.array([-1.0, 0.2, 0.5])}
+    exact = np.asarray(every(truth, truth["starts"]))
+    data = exact + 0.01 * np.random.default_rng(0).normal(size=exact.shape)
+    start = {"length": lx.Positive(1.0), "damping": lx.Positive(0.1), "starts": jnp.array([-0.9, 0.1, 0.6])}
+    found = lx.fit(lambda params: every(params, params["starts"]) - data, start)
+    assert found.ended == "converged"
+    assert found.steps <= 15
+    np.testing.assert_allclose(found.noise, 0.01, rtol=0.05)
+    for name, value in truth.items():
+        assert np.all(np.abs(found.params[name] - value) < 4.0 * found.standard_errors[name])
