@@ -7,7 +7,7 @@ import numpy as np
 from jax import lax
 
 from linkax.equations.configuration import configure
-from linkax.equations.coordinates import neutral, on_manifold, retract
+from linkax.equations.coordinates import neutral, on_manifold, rates, retract
 from linkax.equations.loops import Gap, as_if_closed, flips, gaps, jacobian, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
@@ -270,6 +270,25 @@ def _speeds(system, t, q, held):
     return scale * v, misses, jnp.maximum(off_branch(v), missed)
 
 
+@eqx.filter_custom_jvp
+def _found(demand, q):
+    """Coordinates that meet a demand, by a search from q."""
+    q = demand.search(q)
+    # Loops that do not close stay as open as they were found.
+    met = demand.size(q) <= CLOSED
+    return retract(demand.system.topology, q, jnp.where(met, demand.least_change(q, -demand.rows(q)), 0.0))
+
+
+@_found.def_jvp
+def _found_jvp(primals, changes):
+    """Where the rows stay zero, to any order: the search has no derivative."""
+    (demand, begin), (change, _) = primals, changes
+    q = _found(demand, begin)
+    opens = eqx.filter_jvp(lambda demand: demand.rows(q), (demand,), (change,))[1]
+    along = jnp.where(demand.size(q) <= CLOSED, demand.least_change(q, -opens), 0.0)
+    return q, rates(demand.system.topology, q, along)
+
+
 @eqx.filter_jit
 def _assemble(mechanism, positions, speeds, guess, t):
     system = system_of(mechanism, jnp.result_type(float))
@@ -279,17 +298,12 @@ def _assemble(mechanism, positions, speeds, guess, t):
         for along, entry in zip(given.terms, given.values, strict=True):
             if along.joint in topology.coordinates:
                 q = q.at[topology.places(along)].set(entry)
-    demand = _Demand(system, t, positions)
-    q = lax.stop_gradient(lax.stop_gradient(demand).search(lax.stop_gradient(on_manifold(topology, q))))
-    # Carries the derivative. Loops that do not close stay as open as they were found.
-    met = demand.size(q) <= CLOSED
-    q = retract(topology, q, jnp.where(met, demand.least_change(q, -demand.rows(q)), 0.0))
-
+    q = _found(_Demand(system, t, positions), lax.stop_gradient(on_manifold(topology, q)))
     v, misses, off_branch = _speeds(system, t, q, speeds)
     remainder = _Remainder(
         gap=gaps(configure(system, t, q)),
         length=system.length,
-        positions=Given(positions.terms, demand.misses(q)),
+        positions=Given(positions.terms, _Demand(system, t, positions).misses(q)),
         speeds=misses,
         off_branch=off_branch,
     )
