@@ -106,8 +106,8 @@ def _step(solver: Projected, problem: Problem, t0, t1, y0):
 def _pulled(function, primals, cotangent):
     """Cotangents of a function's arguments, its evaluation being a branch of its own."""
     pull = lambda cotangent: jax.vjp(function, *primals)[1](cotangent)
-    finite = jnp.all(jnp.isfinite(cotangent))
-    return lax.cond(finite, pull, lambda cotangent: jax.tree.map(jnp.zeros_like, primals), cotangent)
+    otherwise = jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), primals)
+    return lax.cond(jnp.all(jnp.isfinite(cotangent)), pull, lambda cotangent: otherwise, cotangent)
 
 
 def _step_backwards(solver: Projected, of_problem, problem, t0, t1, y0, k, y1_bar, dense_bar):

@@ -65,8 +65,9 @@ def simulate(
     - `solver`: a diffrax solver, default `Dopri8`.
     - `stepsize_controller`: replaces rtol and atol of `accuracy`. It sees coordinates in radians
       and lengths of the mechanism, each of magnitude one, and speeds relative to the largest.
-    - `adjoint`: `RecursiveCheckpointAdjoint` (default) for reverse mode, `diffrax.ForwardMode()`
-      for forward mode.
+    - `adjoint`: of diffrax. By default both modes work, over the steps that the run took, where the solver is an
+      explicit Runge-Kutta method and states are saved, without event and dense output; elsewhere it is
+      `RecursiveCheckpointAdjoint`, for reverse mode. `ForwardMode` serves forward mode alone.
     - `event`: as in diffrax; condition functions get (t, state, mechanism).
     - `dtype`: floating-point type of the whole computation, default double precision.
     - `dt0`, `max_steps`, `progress_meter`: as in diffrax.
