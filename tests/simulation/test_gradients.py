@@ -110,7 +110,7 @@ def units(numbers):
     return np.where(numbers == 0.0, 1.0, np.abs(numbers))
 
 
-def central_differences(function, at, step=1e-3):
+def central_differences(function, at, step=3e-4):
     """Of fourth order, along all numbers in their units."""
 
     def along(unit):

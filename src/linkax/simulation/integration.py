@@ -23,7 +23,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.state import State
 
-NOISE_ULPS = 12.0  # in an error estimate. Less would let rounding choose the first steps, batches unlike single runs
+NOISE_ULPS = 1.0
 FIRST_STEP = 1e-3  # of the whole time
 FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 SMALLEST_STEP_ULPS = 4.0
@@ -292,7 +292,7 @@ def _noise(distance, nearest):
 
     Across the motion it grows like 1/d², but that the correction takes off.
     """
-    return (NOISE_ULPS + 1.0 / jnp.maximum(distance, nearest)) * jnp.finfo(distance.dtype).eps
+    return NOISE_ULPS * jnp.finfo(distance.dtype).eps / jnp.maximum(distance, nearest)
 
 
 def _less(error, noise):
