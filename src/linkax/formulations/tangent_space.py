@@ -21,7 +21,7 @@ from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.branches import Crossing
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
-from linkax.formulations.linearised import Changes, moved, unbalanced
+from linkax.formulations.linearised import Changes, Moved, moved, unbalanced
 from linkax.formulations.passage import Course, Value, limit
 from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert_apart, with_mass
 from linkax.tracing import traced_once
@@ -95,11 +95,11 @@ class TangentSpace(AbstractFormulation):
         asked = rate(configuration.system, configuration.t)
         return constrained_solve(split, weight, instant.jacobian, weight @ v, asked, sweeps)[0]
 
-    def _step(self, instant, split, rows):
-        """The smallest change of q that takes `rows` off the linearised loops."""
+    def _least_change(self, instant, split, rows, sweeps):
+        """The smallest change of coordinates or speeds that changes the linearised rows so much."""
         weight = self._weight(instant)
         still = jnp.zeros(weight.shape[0], weight.dtype)
-        return constrained_solve(split, weight, instant.jacobian, still, -rows, sweeps=0)[0]
+        return constrained_solve(split, weight, instant.jacobian, still, rows, sweeps)[0]
 
     def _approximated(self, system, t, q, v):
         """One factorisation, at q; then a fixed number of corrections with it."""
@@ -107,16 +107,16 @@ class TangentSpace(AbstractFormulation):
         split = self._split(instant)
         first = instant
         for _ in range(self.corrections):
-            step = self._step(first, split, residual(instant.configuration))
+            step = self._least_change(first, split, -residual(instant.configuration), sweeps=0)
             instant = coefficients(system, t, retract(system.topology, instant.configuration.q, step))
         v = self._on_velocity_level(instant, v, split, sweeps=2)
         return v, instant, split
 
-    def _onto(self, instant, split):
-        """Rows -> the smallest change of coordinates or speeds that changes them so much."""
-        weight = self._weight(instant)
-        still = jnp.zeros(weight.shape[0], weight.dtype)
-        return lambda rows: constrained_solve(split, weight, instant.jacobian, still, rows, sweeps=2)[0]
+    def _moved(self, instant, v, split, changes) -> Moved:
+        """How the state on the loops here changes with a system's numbers, time, and a state near it."""
+        onto = None if split is None else lambda rows: self._least_change(instant, split, rows, sweeps=2)
+        system, t, q = (getattr(instant.configuration, name) for name in ("system", "t", "q"))
+        return moved(onto, system, t, q, v, Changes(*changes))
 
     def _limit(self, function, powers, system, t, q, v):
         """A function of (method, system, v), t and q at q, or as a limit along v."""
@@ -200,7 +200,7 @@ class TangentSpace(AbstractFormulation):
             split, rows = self._split(instant), residual(instant.configuration)
             gap = _largest(rows)
             done = (gap <= small) | (gap >= before)
-            closer = retract(system.topology, q, self._step(instant, split, rows))
+            closer = retract(system.topology, q, self._least_change(instant, split, -rows, sweeps=0))
             on_level = self._on_velocity_level(instant, v, split, sweeps=1)
             return count + 1, jnp.where(done, q, closer), on_level, split.distance, gap, before
 
@@ -250,8 +250,7 @@ def _evaluated_jvp(primals, changes):
     method, system, t, _, _ = arguments
     found = _evaluated(arguments, correct)
     instant = coefficients(system, t, found.q)
-    onto = method._onto(instant, found.split) if correct else None
-    state = moved(onto, system, t, found.q, found.v, Changes(*changes[1:]))
+    state = method._moved(instant, found.v, found.split if correct else None, changes[1:])
     sides = unbalanced(state, found.acceleration, found.multipliers)
     acceleration, multipliers = method._solve(found.split, instant, *sides, sweeps=2)
     return found, _Evaluated(state.to_q, state.to_v, acceleration, multipliers, _constant(found.split))
@@ -270,8 +269,7 @@ def _corrected_jvp(primals, changes):
     (arguments,), (changes,) = primals, changes
     method, system, t, _, _ = arguments
     q, v, split = _corrected(arguments)
-    onto = method._onto(coefficients(system, t, q), split)
-    state = moved(onto, system, t, q, v, Changes(*changes[1:]))
+    state = method._moved(coefficients(system, t, q), v, split, changes[1:])
     return (q, v, split), (state.to_q, state.to_v, _constant(split))
 
 
@@ -303,6 +301,5 @@ def _close_jvp(primals, changes):
     method, system, t, _, _ = arguments
     q, v = _close(arguments)
     instant = coefficients(system, t, q)
-    onto = method._onto(instant, method._split(instant))
-    state = moved(onto, system, t, q, v, Changes(*changes[1:]))
+    state = method._moved(instant, v, method._split(instant), changes[1:])
     return (q, v), (state.to_q, state.to_v)

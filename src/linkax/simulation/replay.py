@@ -6,6 +6,7 @@ equation of motion once for its tangent and once for its cotangent, where differ
 needs seven copies.
 """
 
+import functools
 from typing import NamedTuple
 
 import diffrax
@@ -96,11 +97,16 @@ def _stages(solver, problem, t0, t1, y0):
     return lax.fori_loop(0, len(nodes), stage, jnp.zeros((len(nodes), len(y0)), y0.dtype))
 
 
-def _step(solver: Projected, problem: Problem, t0, t1, y0):
-    """One step of an explicit Runge-Kutta method with the correction after it, and what interpolates in it."""
+def _uncorrected(solver, problem, t0, t1, y0):
+    """One step of an explicit Runge-Kutta method, as what interpolates in it."""
     k = _stages(solver, problem, t0, t1, y0)
-    y1 = y0 + jnp.asarray(_Tableau.of(solver.solver).result, y0.dtype) @ k
-    return solver.corrected(problem, t1, y1), dict(y0=y0, y1=y1, k=k)
+    return dict(y0=y0, y1=y0 + jnp.asarray(_Tableau.of(solver.solver).result, y0.dtype) @ k, k=k)
+
+
+def _step(solver: Projected, problem: Problem, t0, t1, y0):
+    """The state that a step and the correction after it leave, and what interpolates in it."""
+    dense = _uncorrected(solver, problem, t0, t1, y0)
+    return solver.corrected(problem, t1, dense["y1"]), dense
 
 
 def _pulled(function, primals, cotangent):
@@ -110,17 +116,18 @@ def _pulled(function, primals, cotangent):
     return lax.cond(jnp.all(jnp.isfinite(cotangent)), pull, lambda cotangent: otherwise, cotangent)
 
 
-def _step_backwards(solver: Projected, of_problem, problem, t0, t1, y0, k, y1_bar, dense_bar):
+def _step_backwards(solver: Projected, of_problem, problem, t0, t1, dense, y1_bar, dense_bar):
     """Cotangents of a problem, both times and the state before a step, of the state after it and what interpolates.
 
     `of_problem`: what a problem is of that of it which is differentiated.
     """
     table, duration = _Tableau.of(solver.solver), t1 - t0
+    y0, k = dense["y0"], dense["k"]
     weights, nodes = jnp.asarray(table.weights, y0.dtype), jnp.asarray(table.nodes, y0.dtype)
     result = jnp.asarray(table.result, y0.dtype)
     corrected = lambda problem, t, y: solver.corrected(of_problem(problem), t, y)
     rates = lambda problem, t, y: of_problem(problem).derivative(t, y)
-    problem_bar, t1_bar, y_bar = _pulled(corrected, (problem, t1, y0 + result @ k), y1_bar)
+    problem_bar, t1_bar, y_bar = _pulled(corrected, (problem, t1, dense["y1"]), y1_bar)
     y_bar = y_bar + dense_bar["y1"]
     k_bar = dense_bar["k"] + result[:, None] * y_bar
 
@@ -166,7 +173,7 @@ def _forwards(solver, every, course, steps, changes) -> Motion:
 
         def save(carry):
             j, found = carry
-            within = lambda t0, t1, dense, t: _within(solver, t0, t1, dense, t)
+            within = functools.partial(_within, solver)
             _, value = jax.jvp(within, (*ends, dense, saved[j]), (begin_dot, end_dot, dense_dot, saved_dot[j]))
             return j + 1, found.at[j].set(value)
 
@@ -199,16 +206,14 @@ def _backwards(solver, course, steps, wanted, cotangent: Motion) -> Course:
     def one(carry):
         k, j, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = carry
         ends = steps.ts[k], steps.ts[k + 1]
-        y0 = steps.ys[k]
-        rates = _stages(solver, course.problem, *ends, y0)
-        dense = dict(y0=y0, y1=y0 + jnp.asarray(solver.solver.tableau.b_sol, y0.dtype) @ rates, k=rates)
+        dense = _uncorrected(solver, course.problem, *ends, steps.ys[k])
         begin_bar = end_bar = jnp.zeros_like(ends[0])
         dense_bar = jax.tree.map(jnp.zeros_like, dense)
         if saved is not None:
 
             def save(carry):
                 j, *bars, saved_bar = carry
-                within = lambda t0, t1, dense, t: _within(solver, t0, t1, dense, t)
+                within = functools.partial(_within, solver)
                 *more, t_bar = jax.vjp(within, *ends, dense, saved[j])[1](cotangent.saved[j])
                 bars = jax.tree.map(jnp.add, tuple(bars), tuple(more))
                 return j - 1, *bars, saved_bar.at[j].set(t_bar)
@@ -219,9 +224,7 @@ def _backwards(solver, course, steps, wanted, cotangent: Motion) -> Course:
 
             begin = j, begin_bar, end_bar, dense_bar, saved_bar
             j, begin_bar, end_bar, dense_bar, saved_bar = lax.while_loop(inside, save, begin)
-        more, begin_more, end_more, y_bar = _step_backwards(
-            solver, of_problem, problem, *ends, y0, rates, y_bar, dense_bar
-        )
+        more, begin_more, end_more, y_bar = _step_backwards(solver, of_problem, problem, *ends, dense, y_bar, dense_bar)
         problem_bar = jax.tree.map(jnp.add, problem_bar, more)
         t0_bar = jnp.where(k == 0, begin_bar + begin_more, t0_bar)
         t1_bar = jnp.where(k == last, end_bar + end_more, t1_bar)

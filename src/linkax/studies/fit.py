@@ -15,20 +15,16 @@ import optax
 import optimistix as optx
 import scipy.stats
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
-from tqdm import tqdm
 
-from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.simulation.files import written_whole
-from linkax.studies.parameters import AbstractParameter
+from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.showing import progress_bar
+from linkax.studies.uncertainty import uncertainty
 
 DEFAULT_STEPS = {"residual": 100, "loss": 1000}
 DEFAULT_TOLERANCE = 1e-6
 DEFAULT_RATE = 0.02  # of Adam, in parameters that all start near one
 FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
-NO_INFLUENCE = 1e-10  # of a parameter, relative to that of the most influential
-DEPENDENT = 1e-6  # smallest to largest diagonal of R
-INVOLVED = 1e-3  # share of a parameter in a change that the data do not see
 
 
 class Fit(NamedTuple):
@@ -120,7 +116,7 @@ def fit(
 
     **Warns:** of parameters that the data do not determine.
     """
-    free = _Free.of(params)
+    free = FreeParameters.of(params)
     args = jax.tree.map(jnp.asarray, tuple(args))
     shape = eqx.filter_eval_shape(lambda z, args: function(free.params(z), *args), free.start, args)
     is_loss = isinstance(shape, jax.ShapeDtypeStruct) and shape.shape == ()
@@ -140,11 +136,11 @@ def fit(
     if is_loss:
         return Fit(params, min(losses), None, free.names, None, None, [], history, len(losses) - 1, ended, None)
     residual, slopes = (np.asarray(part) for part in _sensitivity(search, z, args))
-    uncertainty = _uncertainty(residual, slopes, free, z)
-    if uncertainty.undetermined:
+    found = uncertainty(residual, slopes, free, z)
+    if found.undetermined:
         warnings.warn(
-            f"the data do not determine {', '.join(map(repr, uncertainty.undetermined))}: a change of "
-            f"{'it' if len(uncertainty.undetermined) == 1 else 'them together'} leaves the residual as it is; fix "
+            f"the data do not determine {', '.join(map(repr, found.undetermined))}: a change of "
+            f"{'it' if len(found.undetermined) == 1 else 'them together'} leaves the residual as it is; fix "
             "some, or measure what they act on",
             stacklevel=2,
         )
@@ -153,96 +149,14 @@ def fit(
         float(0.5 * residual @ residual),
         residual,
         free.names,
-        uncertainty.covariance,
-        uncertainty.noise,
-        uncertainty.undetermined,
+        found.covariance,
+        found.noise,
+        found.undetermined,
         history,
         len(losses) - 1,
         ended,
-        uncertainty.spread,
+        found.spread,
     )
-
-
-def _is_parameter(node):
-    return isinstance(node, AbstractParameter)
-
-
-class _Free(eqx.Module):
-    """Parameters as functions of a vector z without bounds, whose entries for plain numbers all start near one.
-
-    - `leaves`: numbers, arrays, and parameters that are functions; `structure`: of the tree that they are leaves of.
-    - `scales`: of the free numbers of each leaf.
-    """
-
-    leaves: list
-    scales: list
-    structure: Any = eqx.field(static=True)
-    names: list[str] = eqx.field(static=True)
-
-    @staticmethod
-    def of(params) -> "_Free":
-        leaves, structure = jax.tree.flatten(params, is_leaf=_is_parameter)
-        if not leaves:
-            raise ValueError(f"params are {params!r}; give at least one number to fit")
-        paths = [path for path, _ in jax.tree.leaves_with_path(params, is_leaf=_is_parameter)]
-        names = []
-        for path, leaf in zip(paths, leaves, strict=True):
-            _check(path, leaf)
-            for inner, part in jax.tree.leaves_with_path(leaf.value if _is_parameter(leaf) else leaf):
-                names += _names((*path, *inner), jnp.shape(part))
-        leaves = [leaf if _is_parameter(leaf) else jnp.asarray(leaf, float) for leaf in leaves]
-        scales = [jnp.ones_like(leaf.free) if _is_parameter(leaf) else _magnitudes(leaf) for leaf in leaves]
-        return _Free(leaves, scales, structure, names)
-
-    def _starts(self):
-        free = [leaf.free if _is_parameter(leaf) else leaf for leaf in self.leaves]
-        return [value / scale for value, scale in zip(free, self.scales, strict=True)]
-
-    @property
-    def start(self) -> Float[Array, " p"]:
-        """z where the fit starts."""
-        return ravel_pytree(self._starts())[0]
-
-    def params(self, z):
-        """What the user's function gets."""
-        values = [part * scale for part, scale in zip(ravel_pytree(self._starts())[1](z), self.scales, strict=True)]
-        found = [leaf.value_of(x) if _is_parameter(leaf) else x for leaf, x in zip(self.leaves, values, strict=True)]
-        return jax.tree.unflatten(self.structure, found)
-
-    def vector(self, z):
-        """All numbers of `params`."""
-        return ravel_pytree(self.params(z))[0]
-
-    @property
-    def apart(self) -> np.ndarray:
-        """For each of these numbers, whether it is a rising function of one entry of z alone."""
-        sizes = [
-            (sum(jnp.size(x) for x in jax.tree.leaves(getattr(leaf, "value", leaf))), scale.size)
-            for leaf, scale in zip(self.leaves, self.scales, strict=True)
-        ]
-        return np.concatenate([np.full(numbers, numbers == free) for numbers, free in sizes])
-
-
-def _magnitudes(values):
-    return jnp.where(values == 0.0, 1.0, jnp.abs(values))
-
-
-def _check(path, leaf):
-    if _is_parameter(leaf):
-        return
-    try:
-        finite = np.all(np.isfinite(np.asarray(leaf, dtype=float)))
-    except (TypeError, ValueError) as error:
-        name = _names(path, ())[0]
-        raise ValueError(f"parameter {name!r} is {leaf!r}; give numbers, or Positive, Bounded, ... of them") from error
-    if not finite:
-        raise ValueError(f"parameter {_names(path, ())[0]!r} is {leaf!r}; it must be finite")
-
-
-def _names(path, shape) -> list[str]:
-    key = lambda part: str(getattr(part, "key", getattr(part, "name", getattr(part, "idx", part))))
-    name = ".".join(map(key, path)) or "value"
-    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]
 
 
 def _linearised(function, z):
@@ -256,7 +170,7 @@ class _AbstractSearch(eqx.Module):
 
     solver: Any
     function: Callable
-    free: _Free
+    free: FreeParameters
     mode: str | None = eqx.field(static=True)
 
     def flat(self, z, args):
@@ -335,7 +249,7 @@ def _search(search, args, steps, tolerance, patience, checkpoint, progress):
         (z, best_z, state), losses = kept.load((z, best_z, state))
         best = min(losses)
     ended = "out of steps"
-    with tqdm(total=steps, initial=len(losses), desc="compiling", unit="step", disable=_hides(progress)) as bar:
+    with progress_bar(steps, "step", progress, initial=len(losses)) as bar:
         while len(losses) < steps + 1:
             before = z
             z, state, loss, done = _step(search, z, state, args)
@@ -367,10 +281,6 @@ def _search(search, args, steps, tolerance, patience, checkpoint, progress):
     return best_z, losses, ended
 
 
-def _hides(progress):
-    return None if progress is None else not progress
-
-
 class _Checkpoint(NamedTuple):
     """A file of all that a search goes on from."""
 
@@ -397,50 +307,3 @@ class _Checkpoint(NamedTuple):
             )
         found = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(found, leaves, strict=True)]
         return eqx.combine(jax.tree.unflatten(structure, found), static), header["losses"]
-
-
-class _Uncertainty(NamedTuple):
-    covariance: np.ndarray
-    noise: float
-    undetermined: list[str]
-    spread: Callable
-
-
-def _uncertainty(residual, slopes, free, z) -> _Uncertainty:
-    """Covariance of the parameters from the sensitivities (n, p) of the residual, by their column-pivoted QR."""
-    count, size = slopes.shape
-    norms = np.linalg.norm(slopes, axis=0)
-    matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
-    scale = np.where(matters, norms, 1.0)
-    square = np.linalg.qr(np.where(matters, slopes / scale, 0.0), mode="r")
-    _, r, order = (np.asarray(part) for part in pivoted_qr(jnp.asarray(square)))
-    diagonal = np.abs(np.diagonal(r))
-    rank = int(np.sum(diagonal > DEPENDENT * max(diagonal[0], np.finfo(float).tiny)))
-    to_free = np.zeros((size, size))
-    inverse = np.linalg.inv(r[:rank, :rank]) if rank else np.zeros((0, 0))
-    rows = order[:rank]
-    to_free[np.ix_(rows, rows)] = inverse @ inverse.T / np.outer(scale[rows], scale[rows])
-    noise = float(np.sqrt(residual @ residual / max(count - rank, 1)))
-    # Changes that the residual does not see: of one parameter that is left over, and what makes up for it.
-    unseen = np.zeros((size, size - rank))
-    unseen[order[:rank]] = -inverse @ r[:rank, rank:]
-    unseen[order[rank:]] = np.eye(size - rank)
-    lost = np.any(np.abs(unseen) > INVOLVED, axis=1)
-    slopes_of_params = np.asarray(jax.jacfwd(free.vector)(z))
-    covariance = noise**2 * slopes_of_params @ to_free @ slopes_of_params.T
-    undetermined = np.any(np.abs(slopes_of_params[:, lost]) > 0.0, axis=1)
-    covariance[undetermined, undetermined] = np.inf
-    deviation = noise * np.sqrt(np.where(lost, np.inf, np.diagonal(to_free)))
-    _, unravel = ravel_pytree(free.params(z))
-
-    def spread(times):
-        """Ends of intervals of so many standard deviations."""
-        ends = []
-        for sign in (-1.0, 1.0):
-            linear = np.asarray(free.vector(z)) + sign * times * np.sqrt(np.diagonal(covariance))
-            moved = np.asarray(free.vector(z + sign * times * deviation))
-            ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(np.where(free.apart, moved, linear)))))
-        return tuple(ends)
-
-    names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
-    return _Uncertainty(covariance, noise, names, spread)

@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
-from tqdm import tqdm
 
 from linkax.simulation.report import KNOWN_RESULTS
 from linkax.simulation.results import RESULTS
+from linkax.studies.showing import progress_bar
 from linkax.studies.sweep_store import SweepStore
 
 DEFAULT_CHUNK = 256  # members on one device: more take no less time each
 DEFAULT_MEMORY = 2**31  # bytes
-FINE = ("successful", "event_occurred")
 REASONS = (*KNOWN_RESULTS, "failed", "not_finite_output", "not_run")
+FINE = [REASONS.index(name) for name in ("successful", "event_occurred")]
 NOT_FINITE_OUTPUT, NOT_RUN = (REASONS.index(name) for name in ("not_finite_output", "not_run"))
 EXPLANATIONS = {
     "failed": "failed",
@@ -47,7 +47,7 @@ class Sweep(NamedTuple):
     @property
     def ok(self) -> np.ndarray:
         """Which members went well, (n,)."""
-        return np.isin(self.reasons, [REASONS.index(name) for name in FINE])
+        return np.isin(self.reasons, FINE)
 
     @property
     def failed(self) -> dict[int, str]:
@@ -106,8 +106,7 @@ def sweep(
     if not memory > 0:
         raise ValueError(f"memory is {memory!r}; it must be a positive number of bytes")
     order = _order(difficulty, params, count, dict(chunk=chunk, memory=memory, devices=devices))
-    bar = tqdm(total=count, unit="member", desc="compiling", disable=_hides(progress), smoothing=0.05)
-    with bar:
+    with progress_bar(count, "member", progress, smoothing=0.05) as bar:
         program = _Program.compiled(function, params, chunk or min(DEFAULT_CHUNK, count), memory, devices)
         bar.set_description("sweeping")
         kept = None if store is None else SweepStore.opened(store, program, params, order)
@@ -136,10 +135,6 @@ def _order(difficulty, params, count, options):
     if difficulty.shape != (count,):
         raise ValueError(f"difficulty has shape {difficulty.shape}; give one number for each of {count} members")
     return np.argsort(-np.nan_to_num(difficulty.astype(float), nan=np.inf), kind="stable")
-
-
-def _hides(progress):
-    return None if progress is None else not progress
 
 
 def _is_result(node):
@@ -258,6 +253,7 @@ def _run(program, params, order, kept, bar):
         values = jax.tree.map(lambda leaf: leaf[members], params)
         return start, jax.tree.map(np.asarray, program.run(values))
 
+    failed = int(np.sum(~np.isin(reasons, [*FINE, NOT_RUN])))
     bar.update(sum(min(program.size, count - start) for start in done))
     left = [start for start in own if start not in done]
     began, ran = time.perf_counter(), 0
@@ -270,7 +266,7 @@ def _run(program, params, order, kept, bar):
             kept.save(start, part, computed)
         ran += part.stop - part.start
         bar.update(part.stop - part.start)
-        failed = int(np.sum(~np.isin(reasons[reasons != NOT_RUN], [REASONS.index(name) for name in FINE])))
+        failed += int(np.sum(~np.isin(reasons[part], FINE)))
         bar.set_postfix(failed=failed)
     elapsed = time.perf_counter() - began
     if kept is not None and jax.process_count() > 1:

@@ -8,6 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import zarr
+from jax.experimental import multihost_utils
+
+from linkax.studies.showing import path_parts
 
 FORMAT = 1
 
@@ -76,8 +79,7 @@ class SweepStore(NamedTuple):
 def _names(prefix, tree: Any) -> list[str]:
     """Paths of a tree's leaves as names of arrays."""
     paths = [path for path, _ in jax.tree.leaves_with_path(tree)]
-    name = lambda key: str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key))))
-    return ["/".join([prefix, *map(name, path)]) if path else f"{prefix}/value" for path in paths]
+    return ["/".join([prefix, *path_parts(path)]) if path else f"{prefix}/value" for path in paths]
 
 
 def _identity(program, params, order) -> str:
@@ -90,6 +92,4 @@ def _identity(program, params, order) -> str:
 def _wait():
     """For the process that makes the store."""
     if jax.process_count() > 1:
-        from jax.experimental import multihost_utils
-
         multihost_utils.sync_global_devices("sweep store")

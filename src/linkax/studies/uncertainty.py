@@ -1,0 +1,68 @@
+"""How sure parameters are that measurements gave."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from linkax.linalg.pivoted_qr import pivoted_qr
+
+NO_INFLUENCE = 1e-10  # of a parameter, relative to that of the most influential
+DEPENDENT = 1e-6  # smallest to largest diagonal of R
+INVOLVED = 1e-3  # share of a parameter in a change that the data do not see
+
+
+class Uncertainty(NamedTuple):
+    """Covariance of all parameters, and what cannot be told of them.
+
+    - `covariance`, `noise`, `undetermined`: see `linkax.Fit`.
+    - `spread`: number of standard deviations -> ends of the intervals, in the structure of the parameters.
+    """
+
+    covariance: np.ndarray
+    noise: float
+    undetermined: list[str]
+    spread: Callable
+
+
+def uncertainty(residual, slopes, free, z) -> Uncertainty:
+    """Covariance of the parameters from the sensitivities (n, p) of the residual, by their column-pivoted QR."""
+    count, size = slopes.shape
+    norms = np.linalg.norm(slopes, axis=0)
+    matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
+    scale = np.where(matters, norms, 1.0)
+    square = np.linalg.qr(np.where(matters, slopes / scale, 0.0), mode="r")
+    _, r, order = (np.asarray(part) for part in pivoted_qr(jnp.asarray(square)))
+    diagonal = np.abs(np.diagonal(r))
+    rank = int(np.sum(diagonal > DEPENDENT * max(diagonal[0], np.finfo(float).tiny)))
+    to_free = np.zeros((size, size))
+    inverse = np.linalg.inv(r[:rank, :rank]) if rank else np.zeros((0, 0))
+    rows = order[:rank]
+    to_free[np.ix_(rows, rows)] = inverse @ inverse.T / np.outer(scale[rows], scale[rows])
+    noise = float(np.sqrt(residual @ residual / max(count - rank, 1)))
+    # Changes that the residual does not see: of one parameter that is left over, and what makes up for it.
+    unseen = np.zeros((size, size - rank))
+    unseen[order[:rank]] = -inverse @ r[:rank, rank:]
+    unseen[order[rank:]] = np.eye(size - rank)
+    lost = np.any(np.abs(unseen) > INVOLVED, axis=1)
+    slopes_of_params = np.asarray(jax.jacfwd(free.vector)(z))
+    covariance = noise**2 * slopes_of_params @ to_free @ slopes_of_params.T
+    undetermined = np.any(np.abs(slopes_of_params[:, lost]) > 0.0, axis=1)
+    covariance[undetermined, undetermined] = np.inf
+    deviation = noise * np.sqrt(np.where(lost, np.inf, np.diagonal(to_free)))
+    _, unravel = ravel_pytree(free.params(z))
+
+    def spread(times):
+        """Ends of intervals of so many standard deviations."""
+        ends = []
+        for sign in (-1.0, 1.0):
+            linear = np.asarray(free.vector(z)) + sign * times * np.sqrt(np.diagonal(covariance))
+            moved = np.asarray(free.vector(z + sign * times * deviation))
+            ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(np.where(free.apart, moved, linear)))))
+        return tuple(ends)
+
+    names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
+    return Uncertainty(covariance, noise, names, spread)
