@@ -6,7 +6,8 @@ from pathlib import Path
 # Tests spend their time on compiling, which these halve and more; they change how code is made, not what it computes.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true --xla_backend_optimization_level=0",
+    "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true --xla_backend_optimization_level=0 "
+    "--xla_cpu_parallel_codegen_split_count=1",
 )
 # What one test file has compiled, in this process or another, the next one reads. Errors of Equinox as numbers that are
 # not finite: a program with a callback in it cannot be kept.

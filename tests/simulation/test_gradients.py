@@ -87,7 +87,9 @@ CASES = {
     "spatial-four-link": Case("spatial-four-link", 1.0),
     "rigid-crane": Case("rigid-crane", 0.5),
 }
-VARIANTS = [("crank-slider", "regular"), ("crank-slider", "SC4"), *((scene, None) for scene in list(CASES)[1:])]
+SLOW = ("n-four-bar", "spatial-four-link", "rigid-crane")
+marked = lambda scene, *more: pytest.param(scene, *more, marks=[pytest.mark.slow] if scene in SLOW else [])
+VARIANTS = [("crank-slider", "regular"), ("crank-slider", "SC4"), *(marked(scene, None) for scene in list(CASES)[1:])]
 
 
 @functools.cache
@@ -131,7 +133,7 @@ def test_both_modes_agree_with_central_differences(scene, variant):
     assert np.max(off) <= 1e-6
 
 
-@pytest.mark.parametrize("scene", ["bricard", "rigid-crane"])
+@pytest.mark.parametrize("scene", [marked("bricard"), marked("rigid-crane")])
 def test_duplicated_cut_joints_change_no_derivative(scene):
     case, (_, derivatives) = CASES[scene], program(scene)
     at = case.numbers()
@@ -140,6 +142,7 @@ def test_duplicated_cut_joints_change_no_derivative(scene):
     np.testing.assert_allclose(duplicated, forwards, atol=1e-9 * np.max(np.abs(forwards)))
 
 
+@pytest.mark.slow
 def test_hessian_times_vector():
     """Forwards over backwards, against differences of gradients."""
     at, along = numbers(), {name: jnp.asarray(0.5 + index) for index, name in enumerate(numbers())}

@@ -41,18 +41,7 @@ class Mobility(eqx.Module):
     @property
     def rows(self) -> tuple[tuple[str, str], ...]:
         """(joint or constraint, row of Table 1 of the paper) of every row."""
-        topology = self.topology
-        cuts = topology.joints[topology.num_bodies :]
-        rotation = lambda rows: [(cuts[cut], ROTATIONS[i, j]) for cut, i, j in rows]
-        translation = lambda rows: [(cuts[cut], TRANSLATIONS[i]) for cut, i in rows]
-        return (
-            *rotation(topology.rotation_rows),
-            *translation(topology.translation_rows),
-            *((cuts[cut], "combined") for cut in topology.combining),
-            *((name, "coordinates") for name in topology.constraints),
-            *rotation(topology.immobile_rotation_rows),
-            *translation(topology.immobile_translation_rows),
-        )
+        return row_names(self.topology)
 
     @property
     def redundant(self) -> dict[str, tuple[str, ...]]:
@@ -62,6 +51,21 @@ class Mobility(eqx.Module):
             if dispensable:
                 found[name] = (*found.get(name, ()), row)
         return found
+
+
+def row_names(topology: Topology) -> tuple[tuple[str, str], ...]:
+    """(joint or constraint, row of Table 1 of the paper) of every row, those that no motion changes last."""
+    cuts = topology.joints[topology.num_bodies :]
+    rotation = lambda rows: [(cuts[cut], ROTATIONS[i, j]) for cut, i, j in rows]
+    translation = lambda rows: [(cuts[cut], TRANSLATIONS[i]) for cut, i in rows]
+    return (
+        *rotation(topology.rotation_rows),
+        *translation(topology.translation_rows),
+        *((cuts[cut], "combined") for cut in topology.combining),
+        *((name, "coordinates") for name in topology.constraints),
+        *rotation(topology.immobile_rotation_rows),
+        *translation(topology.immobile_translation_rows),
+    )
 
 
 def mobility(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = BALANCED) -> Mobility:

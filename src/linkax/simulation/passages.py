@@ -34,10 +34,20 @@ class Passages(NamedTuple):
 def passages(solution) -> Passages:
     """Passages of one `linkax.Solution`, not of a batch.
 
+    **Raises:** `ValueError` for a batch, or where the solution saved functions of its own.
+    """
+    times, _ = singular_states(solution)
+    if isinstance(solution.formulation, ClassicalFormulation):  # which does not measure how close its stages come
+        return Passages(times, math.nan)
+    lost = np.log10(max(len(times), 1) / max(float(solution.closest), np.finfo(float).eps))
+    return Passages(times, float(max(lost, 0.0)))
+
+
+def singular_states(solution):
+    """Times at which a motion goes through singular configurations, (n,), and the coordinates there, (n, n_q).
+
     J at one saved state times the right inverse of J at the one before has eigenvalues near one;
     one that is negative has passed through zero between, and that is where it is sought.
-
-    **Raises:** `ValueError` for a batch, or where the solution saved functions of its own.
     """
     if solution.ts.ndim != 1:
         raise ValueError(f"passages of a batch of shape {solution.ts.shape[:-1]}; ask for one member at a time")
@@ -47,16 +57,15 @@ def passages(solution) -> Passages:
     reached = np.flatnonzero(np.isfinite(ts[1:]))
     ends = [_turned(change) for change in _between(solution, reached, np.ones(len(reached)))[0]]
     intervals, ends = np.repeat(reached, [len(values) for values in ends]), np.concatenate([np.empty(0), *ends])
-    places, distances = _zeros(solution, intervals, ends)
+    places, distances, states = _zeros(solution, intervals, ends)
     around = np.asarray(solution.singularity_distance())
     vanished = distances <= VANISHED * np.maximum(around[intervals], around[intervals + 1])
-    times = np.sort((ts[intervals] + places * (ts[intervals + 1] - ts[intervals]))[vanished])
+    times = (ts[intervals] + places * (ts[intervals + 1] - ts[intervals]))[vanished]
+    order = np.argsort(times)
+    times, states = times[order], states[vanished][order]
     spacing = np.max(np.diff(ts[: len(reached) + 1]), initial=0.0)
-    times = times[np.diff(times, prepend=-np.inf) > TOGETHER * spacing]
-    if isinstance(solution.formulation, ClassicalFormulation):  # which does not measure how close its stages come
-        return Passages(times, math.nan)
-    lost = np.log10(max(len(times), 1) / max(float(solution.closest), np.finfo(float).eps))
-    return Passages(times, float(max(lost, 0.0)))
+    apart = np.diff(times, prepend=-np.inf) > TOGETHER * spacing
+    return times[apart], states[apart]
 
 
 def _eigenvalues(change):
@@ -71,22 +80,23 @@ def _turned(change):
 
 
 def _zeros(solution, intervals, ends):
-    """Where between saved states the eigenvalues are zero that end at `ends`, and d there."""
+    """Where between saved states the eigenvalues are zero that end at `ends`, d and the coordinates there."""
     low, high = (np.zeros(len(ends)), np.ones(len(ends))), (np.ones(len(ends)), ends)
     places, distances = low
+    states = np.zeros((len(ends), solution.q.shape[-1]))
     for _ in range(REFINEMENTS if len(ends) else 0):
         (a, f), (b, g) = low, high
         places = a + (b - a) * f / (f - g)
-        changes, distances = _between(solution, intervals, places)
+        changes, distances, states = _between(solution, intervals, places)
         values = [_eigenvalues(change).real for change in changes]
         value = np.array([value[np.argmin(np.abs(value))] for value in values])
         low = np.where(value > 0.0, (places, value), low)
         high = np.where(value > 0.0, high, (places, value))
-    return places, distances
+    return places, distances, states
 
 
 def _between(solution, intervals, places):
-    """What `passages` takes eigenvalues of, and d, at places from 0 to 1 between saved states."""
+    """What eigenvalues are taken of, d and q, at places from 0 to 1 between saved states."""
     found = _between_states(solution, jnp.asarray(intervals), jnp.asarray(places))
     return jax.tree.map(np.asarray, found)
 
@@ -107,8 +117,9 @@ def _between_states(solution, intervals, places):
             k1=duration * rates(system.topology, solution.q[k + 1], solution.v[k + 1]),
         )
         t = solution.ts[k] + place * duration
-        here = method.crossing(system, t, on_manifold(system.topology, hermite.evaluate(place)))
+        q = on_manifold(system.topology, hermite.evaluate(place))
+        here = method.crossing(system, t, q)
         before = method.crossing(system, solution.ts[k], solution.q[k])
-        return here.jacobian @ before.inverse.normal, here.inverse.distance
+        return here.jacobian @ before.inverse.normal, here.inverse.distance, q
 
     return jax.vmap(at)(intervals, places)

@@ -1,0 +1,121 @@
+"""Whether a motion has derivatives: none by parameters that contradict redundant loops, or undo a singular position."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.analysis.mobility import row_names
+from linkax.equations.configuration import configure
+from linkax.equations.loops import immobile_residual, jacobian, residual
+from linkax.equations.system import system_of
+from linkax.simulation.passages import singular_states
+from linkax.simulation.report import result_name
+from linkax.simulation.solution import Solution
+from linkax.studies.free_parameters import FreeParameters
+
+DEPENDENT = 1e-4  # singular values of J in radians and lengths of the mechanism: of rows that depend on others
+OPENS = 1e-3  # the part of a change of the loops that no motion takes back
+ROUNDING = 1e-9  # of rows, by relative changes of parameters
+
+
+class Differentiability(NamedTuple):
+    """By which parameters a motion has derivatives.
+
+    - `names`: of the p numbers in `params`.
+    - `reasons`: of each that it has no derivative by, why.
+    - `directions`: changes of all parameters together that keep what is there, as orthonormal columns (p, k), each
+      parameter in units of its own value.
+    """
+
+    names: list[str]
+    reasons: dict[str, str]
+    directions: np.ndarray
+
+    @property
+    def ok(self) -> bool:
+        """Whether there are derivatives by all parameters."""
+        return not self.reasons
+
+    def __str__(self):
+        return "\n".join(f"{name}: {self.reasons.get(name, 'differentiable')}" for name in self.names)
+
+
+def differentiability(function: Callable, params: Any) -> Differentiability:
+    """Find by which parameters the motion has derivatives.
+
+    Where constraints are redundant, always or in a singular configuration alone, a change of a length may contradict
+    them: the mechanism locks, or its branches part and it turns back where it went through. `jax.grad` by such a
+    parameter is the derivative of the motion that comes nearest, which is not that of the mechanism. To first order
+    this is so where uᵀ ∂c/∂θ ≠ 0 for a u with uᵀ J = 0; that is looked for at all saved states and passages.
+
+    **Arguments:**
+
+    - `function`: params -> a `Solution` of one motion that went well, such as what `simulate` returns.
+    - `params`: pytree of numbers and arrays, as for `linkax.fit`.
+
+    **Raises:** `ValueError` for a function that returns no `Solution`, a batch, or one of a run that failed.
+    """
+    free = FreeParameters.of(params)
+    solution = function(free.params(free.start))
+    if not isinstance(solution, Solution):
+        raise ValueError(f"the function returns {type(solution).__name__}; it must return a linkax.Solution")
+    if (name := result_name(solution.result)) not in ("successful", "event_occurred"):
+        raise ValueError(f"the run ended as {name!r}: there is no motion to differentiate")
+    times, states = singular_states(solution)
+    reached = np.isfinite(np.asarray(solution.ts))
+    ts = np.concatenate([np.asarray(solution.ts)[reached], times])
+    qs = np.concatenate([np.asarray(solution.q)[reached], states])
+    rows, changes = (np.asarray(part) for part in _linearised(function, free, free.start, ts, qs))
+    joints = [joint for joint, _ in row_names(solution.mechanism.topology)]
+    reasons, opening = {}, [np.zeros((1, len(free.names)))]
+    for index, (t, row, change) in enumerate(zip(ts, rows, changes, strict=True)):
+        left, sizes, _ = np.linalg.svd(row)
+        rank = int(np.sum(sizes > DEPENDENT * np.max(sizes, initial=1.0)))
+        opens = left[:, rank:].T @ change
+        opening.append(opens)
+        most = OPENS * np.linalg.norm(change, axis=0) + ROUNDING
+        for which in np.flatnonzero(np.linalg.norm(opens, axis=0) > most):
+            joint = joints[int(np.argmax(np.abs(left[:, rank:] @ opens[:, which])))]
+            why = _locks(joint) if index < np.sum(reached) else _unfolds(joint, t)
+            reasons.setdefault(free.names[which], f"not differentiable: {why}")
+    _, sizes, right = np.linalg.svd(np.concatenate(opening))
+    directions = right[int(np.sum(sizes > OPENS * sizes[0] + ROUNDING)) :].T
+    return Differentiability(free.names, reasons, directions)
+
+
+def _locks(joint):
+    return (
+        f"alone it contradicts redundant constraints of the loop that joint {joint!r} closes, and the mechanism locks "
+        "or cannot be assembled"
+    )
+
+
+def _unfolds(joint, t):
+    return (
+        f"alone it undoes the singular configuration at t = {t:.6g} s of the loop that joint {joint!r} closes, and the "
+        "mechanism takes another branch or turns back"
+    )
+
+
+@eqx.filter_jit
+def _linearised(function, free, z, ts, qs):
+    """J of all rows and their changes with z, at given coordinates: all rows in radians and lengths."""
+    dtype = qs.dtype
+
+    def opened(z):
+        system = system_of(function(free.params(z)).mechanism, dtype)
+
+        def at(t, q):
+            configuration = configure(system, t, q)
+            return jnp.concatenate([residual(configuration), immobile_residual(configuration)])
+
+        return jax.vmap(at)(ts, qs)
+
+    system = system_of(function(free.params(z)).mechanism, dtype)
+    slopes = jax.vmap(lambda t, q: jacobian(configure(system, t, q)) * system.units)(ts, qs)
+    still = jnp.zeros((len(ts), system.topology.num_immobile_rows, slopes.shape[-1]), dtype)
+    return jnp.concatenate([slopes, still], axis=1), jax.jacfwd(opened)(z)
