@@ -77,11 +77,15 @@ from linkax.studies.comparison import Comparison as Comparison  # noqa: E402
 from linkax.studies.comparison import Stepping as Stepping  # noqa: E402
 from linkax.studies.comparison import Trial as Trial  # noqa: E402
 from linkax.studies.comparison import compare as compare  # noqa: E402
+from linkax.studies.differentiability import Differentiability as Differentiability  # noqa: E402
+from linkax.studies.differentiability import differentiability as differentiability  # noqa: E402
 from linkax.studies.fit import Fit as Fit  # noqa: E402
 from linkax.studies.fit import fit as fit  # noqa: E402
 from linkax.studies.parameters import Bounded as Bounded  # noqa: E402
 from linkax.studies.parameters import Inertia as Inertia  # noqa: E402
 from linkax.studies.parameters import PhysicalInertia as PhysicalInertia  # noqa: E402
 from linkax.studies.parameters import Positive as Positive  # noqa: E402
+from linkax.studies.shooting import Shots as Shots  # noqa: E402
+from linkax.studies.shooting import shoot as shoot  # noqa: E402
 from linkax.studies.sweep import Sweep as Sweep  # noqa: E402
 from linkax.studies.sweep import sweep as sweep  # noqa: E402

@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 from linkax.simulation.files import written_whole
 from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.showing import progress_bar
 from linkax.studies.uncertainty import uncertainty
 
@@ -98,8 +99,8 @@ def fit(
     - `params`: pytree of numbers and arrays, where the fit starts; `Positive`, `Bounded` and `PhysicalInertia` among
       them keep to what makes sense. Numbers are fitted in units of their own start.
     - `args`: what else the function gets, measurements above all: other ones of the same shapes compile nothing anew.
-    - `optimiser`: for a residual an optimistix least-squares solver, default `optimistix.LevenbergMarquardt`; for
-      either one of optax, default for a loss `optax.adam`.
+    - `optimiser`: for a residual an optimistix least-squares solver, default Levenberg and Marquardt's method with
+      damping relative to the sensitivities; for either one of optax, default for a loss `optax.adam`.
     - `steps`: at most so many; default 100 for a residual, 1000 for a loss.
     - `tolerance`: of parameters and residual, relative, at which Levenberg-Marquardt ends; of the loss, relative, that
       a step of optax must gain to count as one that gains.
@@ -124,7 +125,7 @@ def fit(
     if mode not in (None, "forward", "reverse"):
         raise ValueError(f"mode is {mode!r}; give 'forward', 'reverse', or None")
     if optimiser is None:
-        optimiser = optax.adam(DEFAULT_RATE) if is_loss else optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+        optimiser = optax.adam(DEFAULT_RATE) if is_loss else LevenbergMarquardt(tolerance, tolerance)
     by_squares = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
     if by_squares and is_loss:
         raise ValueError("least squares need a residual; this function returns one number, so give an optax optimiser")

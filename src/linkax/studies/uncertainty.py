@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from linkax.linalg.pivoted_qr import pivoted_qr
 
 NO_INFLUENCE = 1e-10  # of a parameter, relative to that of the most influential
-DEPENDENT = 1e-6  # smallest to largest diagonal of R
+DEPENDENT = 1e-8  # smallest to largest diagonal of R: what rounding leaves of derivatives
 INVOLVED = 1e-3  # share of a parameter in a change that the data do not see
 
 

@@ -1,0 +1,92 @@
+"""The method of Levenberg and Marquardt, of parts of optimistix, with damping that knows no units."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import optimistix as optx
+
+FIRST_DAMPING = 1e-2
+LEAST_DAMPING = 1e-12
+HIGHER, LOWER = 2.0, 5.0
+ENOUGH = 0.25  # of what a step promised to gain, for the next to be damped less
+NOTHING = 1e-2  # of rtol: what is not worth a step
+
+
+class _ScaledDescent(optx.AbstractDescent):
+    """Steps damped by λ D², λ one over the size of the step; D: largest norms so far of the columns of J.
+
+    optimistix damps by λ alone, which for parameters and residuals of some magnitude is too much, for others nothing.
+    (Moré, The Levenberg-Marquardt algorithm, 1978, section 6, says why D must not fall.)
+    """
+
+    def init(self, y, f_info_struct):
+        none = jnp.zeros(min(len(y), f_info_struct.residual.shape[0]), y.dtype)
+        return jnp.outer(none, y), none, none, jnp.zeros_like(y)
+
+    def query(self, y, f_info, state):
+        slopes = f_info.jac.as_matrix()
+        largest = jnp.maximum(state[-1], jnp.linalg.norm(slopes, axis=0))
+        sizes = jnp.where(largest > 0.0, largest, 1.0)
+        left, values, right = jnp.linalg.svd(slopes / sizes, full_matrices=False)
+        return right / sizes, left.T @ f_info.residual, values, largest
+
+    def step(self, step_size, state):
+        right, residual, values, _ = state
+        return -right.T @ (residual * values / (values**2 + 1.0 / step_size)), optx.RESULTS.successful
+
+
+class _DelayedDamping(optx.AbstractSearch):
+    """λ that rises slowly where a step fails and falls quickly where one succeeds.
+
+    Transtrum, Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization, 2012:
+    along a narrow valley, where steps fail that are too long, this takes the fewest.
+
+    The state is λ, and whether no step from here can gain more than `rtol` of the loss.
+    """
+
+    rtol: float
+
+    def init(self, y, f_info_struct):
+        return jnp.asarray(FIRST_DAMPING, y.dtype), jnp.zeros((), bool)
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        damping, _ = state
+        before, after = f_info.as_min(), f_eval_info.as_min()
+        expected = -optx.ClassicalTrustRegion().predict_reduction(y_eval - y, f_info)
+        gained = before - after
+        accept = first_step | (gained > 0.0)
+        less = jnp.where(gained > ENOUGH * expected, damping / LOWER, damping)
+        changed = jnp.where(accept, less, damping * HIGHER)
+        # A step that fails though little was expected meets the noise of the function.
+        enough = jnp.where(gained > 0.0, NOTHING * self.rtol, self.rtol)
+        idle = jnp.logical_not(first_step) & (expected <= enough * before)
+        damping = jnp.maximum(jnp.where(first_step, damping, changed), LEAST_DAMPING)
+        return 1.0 / damping, accept, optx.RESULTS.successful, (damping, idle)
+
+
+class LevenbergMarquardt(optx.AbstractGaussNewton):
+    """`optimistix.LevenbergMarquardt`, but for its damping, how it changes, and when it ends.
+
+    - `rtol`, `atol`: changes of parameters and residual at which it ends; also what a step must promise to gain,
+      relative to the loss, for it to go on where steps fail.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable
+    descent: optx.AbstractDescent
+    search: optx.AbstractSearch
+    verbose: Callable
+
+    def __init__(self, rtol, atol):
+        self.rtol, self.atol = rtol, atol
+        self.norm, self.verbose = optx.max_norm, _silent
+        self.descent, self.search = _ScaledDescent(), _DelayedDamping(rtol)
+
+    def terminate(self, fn, y, args, options, state, tags):
+        done, result = super().terminate(fn, y, args, options, state, tags)
+        return done | state.search_state[1], result
+
+
+def _silent(**values):
+    pass
