@@ -24,6 +24,8 @@ from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.state import State
 
 NOISE_ULPS = 1.0
+SEEN_ULPS = 512.0  # of estimates: rounding changes larger ones by less than a hundredth
+SEEN = 1e-3  # of the tolerance, which is as small
 FIRST_STEP = 1e-3  # of the whole time
 FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 SMALLEST_STEP_ULPS = 4.0
@@ -254,7 +256,12 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.nearest)
             # The second is none where the step has led to no numbers.
             largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), *scales)
-            scaled = tuple(_less(e / units, noise * scale) for e, scale in zip(y_error.error, largest, strict=True))
+            # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
+            least = jnp.minimum(SEEN_ULPS * jnp.finfo(units.dtype).eps, SEEN * args.accuracy.rtol)
+            scaled = tuple(
+                jnp.maximum(jnp.abs(_less(e / units, noise * scale)), least * scale)
+                for e, scale in zip(y_error.error, largest, strict=True)
+            )
         before, retries = controller_state
         keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
             t0, t1, *scales, args, scaled, error_order, before
