@@ -9,7 +9,11 @@ import pytest
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+SLOW = ("identification", "straight_line_synthesis", "design_sweep")  # minutes of compiling
+MARKED = [pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else [], id=path.stem) for path in NOTEBOOKS]
+
+
+@pytest.mark.parametrize("path", MARKED)
 def test_a_notebook_runs(path, monkeypatch, capsys):
     matplotlib.use("agg")
     shown = []
