@@ -86,6 +86,14 @@ def test_errors_count_in_the_units_of_the_mechanism_less_rounding():
     assert not bool(adapt(tight, at([1e-14, 0.0], [0.0, 0.0]))[0])
 
 
+def test_rounding_in_an_estimate_does_not_choose_the_next_step():
+    def next_step(size):
+        _, _, end, *_ = adapt(CONTROLLERS[0], FAR._replace(error=(jnp.array([size, 0.0]), jnp.zeros(2))))
+        return float(end)
+
+    assert next_step(1e-14) == next_step(3e-14) > next_step(1e-11)
+
+
 def test_rounding_grows_near_a_singular_configuration_up_to_the_rank_tolerance():
     tight = diffrax.PIDController(rtol=1e-30, atol=1e-30)
     ends = lambda size, d: FAR._replace(

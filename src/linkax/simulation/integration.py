@@ -232,10 +232,14 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     @property
     def is_adaptive(self) -> bool:
         """Whether the controller inside chooses the steps by their errors."""
+        return isinstance(self._innermost, diffrax.AbstractAdaptiveStepSizeController)
+
+    @property
+    def _innermost(self):
         inner = self.controller
         while hasattr(inner, "controller"):
             inner = inner.controller
-        return isinstance(inner, diffrax.AbstractAdaptiveStepSizeController)
+        return inner
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         _, v = args.unpacked(y0)
@@ -252,12 +256,12 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         units = args.system.units
         scales = tuple(_magnitudes(args.unpacked(y), units) for y in (y0, y1_candidate))
         scaled = None
-        if y_error.error is not None:
+        if y_error.error is not None and self.is_adaptive:
             noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.nearest)
             # The second is none where the step has led to no numbers.
             largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), *scales)
             # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
-            least = jnp.minimum(SEEN_ULPS * jnp.finfo(units.dtype).eps, SEEN * args.accuracy.rtol)
+            least = jnp.minimum(SEEN_ULPS * jnp.finfo(units.dtype).eps, SEEN * self._innermost.rtol)
             scaled = tuple(
                 jnp.maximum(jnp.abs(_less(e / units, noise * scale)), least * scale)
                 for e, scale in zip(y_error.error, largest, strict=True)
