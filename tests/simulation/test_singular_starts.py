@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 from scipy.special import ellipeinc
 
 import linkax as lx
+from linkax.scenes import SCENES
 
 
 class FreeCrankSlider:
@@ -67,7 +68,7 @@ def anywhere():
 def test_errors_of_many_starts_lie_on_one_curve(starts):
     starts = starts()
     exact = starts.exact()
-    for rtol in (1e-6, 1e-8, 1e-10, 1e-12, 1e-13):
+    for rtol in (1e-6, 1e-10, 1e-13):
         found = starts.batch(rtol)
         assert np.all(found.result == lx.RESULTS.successful)
         tip, slider = found.position("crank", at="tip")[:, 0], found.position("slider")[:, 0]
@@ -79,8 +80,8 @@ def test_errors_of_many_starts_lie_on_one_curve(starts):
 def test_members_of_a_batch_equal_single_runs():
     starts = anywhere()
     together = starts.batch(1e-12)
-    alone = [starts.run(q, v, lx.PRECISE).q for q, v in zip(starts.q, starts.v, strict=True)]
-    assert np.max(np.abs(together.q - np.stack(alone))) <= 1e-10
+    alone = [starts.run(q, v, lx.PRECISE).q for q, v in zip(starts.q[::8], starts.v[::8], strict=True)]
+    assert np.max(np.abs(together.q[::8] - np.stack(alone))) <= 1e-10
 
 
 # The crank-slider with crank and rod on each other: the slider stands still, or moves.
@@ -102,6 +103,21 @@ def test_speeds_are_completed_on_a_branch(speeds, slider_speed):
     np.testing.assert_allclose(found.joint_speed("guide")[0], slider_speed, atol=1e-12)
     slider, tip = found.position("slider")[:, 0], found.position("crank", at="tip")[:, 0]
     np.testing.assert_allclose(slider, 2.0 * tip if slider_speed else 0.0 * tip, atol=1e-11)
+
+
+def test_derivatives_of_speeds_on_a_branch():
+    """Of x = 2 l cos θ and its like, by the length of both rods and by the speed asked."""
+    settings = SCENES["crank-slider"].settings("SC1", {})
+
+    def speeds(length, speed):
+        mechanism = SCENES["crank-slider"].mechanism(settings | {"crank": length, "rod": length})
+        return lx.assemble(mechanism, UPRIGHT, {"guide": speed}, guess={"crank_pin": -np.pi}).v
+
+    length, speed = jnp.asarray(1.5), jnp.asarray(-2.0)
+    turns = np.array([-0.5, 0.0, 1.0]) / length
+    exact = -speed / length * turns, turns + np.array([0.0, 1.0, 0.0])
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(speeds, (0, 1)))(length, speed), exact, atol=1e-12)
 
 
 def test_speeds_on_no_branch_are_found_out():

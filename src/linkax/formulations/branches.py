@@ -15,7 +15,7 @@ from linkax.equations.configuration import Configuration, configure
 from linkax.equations.loops import bias, drive_acceleration, jacobian
 from linkax.equations.motion import move
 from linkax.equations.system import System
-from linkax.linalg.constrained_solve import Inverse, invert_apart
+from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert_apart
 from linkax.linalg.pivoted_qr import pivoted_qr
 
 OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
@@ -33,9 +33,13 @@ class Crossing(eqx.Module):
 
     @staticmethod
     def at(system: System, t, q, rank_tolerance) -> "Crossing":
-        """At coordinates q, split in the identity metric."""
-        configuration = configure(system, t, q)
-        rows = jacobian(configuration)
+        """At coordinates q."""
+        return Crossing.of(configure(system, t, q), rank_tolerance)
+
+    @staticmethod
+    def of(configuration: Configuration, rank_tolerance) -> "Crossing":
+        """Split in the identity metric."""
+        system, rows = configuration.system, jacobian(configuration)
         inverse = invert_apart(None, rows, system.units, rank_tolerance, system.topology.islands)
         return Crossing(configuration, rows, inverse)
 
@@ -55,7 +59,10 @@ class Crossing(eqx.Module):
 
         `scale`: what the speeds v are to be multiplied by; that of γ is then its square.
         """
-        return self._outside(self._bias(v) + self._driven(scale))
+        gamma, units = self._bias(v) + self._driven(scale), self.configuration.system.units
+        # With derivatives, which the split has none of; J a is the same in any metric.
+        metric, still = jnp.diag(units**-2), jnp.zeros_like(v)
+        return gamma - self.jacobian @ constrained_solve(self.inverse, metric, self.jacobian, still, gamma, sweeps=0)[0]
 
     def _driven(self, scale):
         return drive_acceleration(self.configuration.system, self.configuration.t) / scale**2

@@ -139,10 +139,9 @@ class _Demand(eqx.Module):
     t: jax.Array
     held: Given
 
-    def misses(self, q):
+    def misses(self, configuration):
         """How far what is held is from where it should be, one number for each speed."""
         topology, apart = self.system.topology, []
-        configuration = configure(self.system, self.t, q)
         for along, entry in zip(self.held.terms, self.held.values, strict=True):
             kind = topology.joint_types[topology.joints.index(along.joint)]
             turning = 3 * kind.has_quaternion
@@ -154,60 +153,62 @@ class _Demand(eqx.Module):
             if kind.has_quaternion and along.index is None:
                 found = configuration.joint_coordinates(along.joint)[:4]
                 missed.insert(0, rotation_vector(multiply(found, conjugate(entry[:4] / jnp.linalg.norm(entry[:4])))))
-            apart.append(jnp.concatenate([jnp.zeros(0, q.dtype), *missed]))
+            apart.append(jnp.concatenate([jnp.zeros(0, self.system.dtype), *missed]))
         return tuple(apart)
 
-    def rows(self, q):
+    def rows(self, configuration):
         """All that must vanish: loop rows, axes that point apart, misses."""
-        configuration = configure(self.system, self.t, q)
-        return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(q)])
+        return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(configuration)])
 
-    def jacobian(self, q):
-        """Derivative of the rows, where the loops are closed; elsewhere the direction that closes them."""
-        configuration = as_if_closed(configure(self.system, self.t, q))
-        still = jnp.zeros(self.system.topology.num_speeds, q.dtype)
-        held = jax.jacfwd(lambda change: self.misses(retract(self.system.topology, q, change)))(still)
-        return jnp.concatenate([jacobian(configuration), flips(configuration)[1], *held])
+    def linearised(self, q):
+        """The rows, and their derivative where the loops are closed; elsewhere the direction that closes them."""
+        configuration, held = configure(self.system, self.t, q), ()
+        if self.held.terms:
+            moved = lambda change: configure(self.system, self.t, retract(self.system.topology, q, change))
+            still = jnp.zeros(self.system.topology.num_speeds, q.dtype)
+            held = jax.jacfwd(lambda change: self.misses(moved(change)))(still)
+        closed = as_if_closed(configuration)
+        return self.rows(configuration), jnp.concatenate([jacobian(closed), flips(closed)[1], *held])
 
-    def least_change(self, q, right):
+    def least_change(self, slopes, right):
         """The smallest change that changes the rows by `right`, in radians and lengths of the mechanism."""
-        units, rows = self.system.units, self.jacobian(q)
-        inverse = invert(None, rows, units, BALANCED.method(q.dtype).rank_tolerance)
-        return constrained_solve(inverse, jnp.diag(units**-2), rows, jnp.zeros_like(units), right)[0]
+        units = self.system.units
+        inverse = invert(None, slopes, units, BALANCED.method(slopes.dtype).rank_tolerance)
+        return constrained_solve(inverse, jnp.diag(units**-2), slopes, jnp.zeros_like(units), right)[0]
 
-    def size(self, q):
-        rows = self.rows(q)
-        return jnp.sqrt(jnp.sum(rows * rows))
-
-    def descent(self, q):
+    def descent(self, rows, slopes):
         """The steepest descent of the rows' squares, as long as their linearisation says."""
-        units, rows, slopes = self.system.units, self.rows(q), self.jacobian(q)
-        downhill = -(units**2) * (rows @ slopes)
+        downhill = -(self.system.units**2) * (rows @ slopes)
         change = slopes @ downhill
         scale = jnp.sum(change * change)
         return downhill * jnp.where(scale > 0.0, -(rows @ change) / jnp.where(scale > 0.0, scale, 1.0), 0.0)
 
     def meet(self, q):
-        """Damped Newton steps from q until the rows vanish or stop falling; descent where those fail."""
+        """Damped Newton steps from q until the rows vanish or stop falling; descent where those fail.
+
+        **Returns:** where they lead, and the size of the rows there.
+        """
 
         def unfinished(carry):
             count, _, size, before = carry
-            return (count < MOST_STEPS) & (size > SMALL) & (size < before)
+            return (count == 0) | ((count < MOST_STEPS) & (size > SMALL) & (size < before))
 
         def improve(carry):
             count, q, size, _ = carry
-            steps = jnp.stack([self.least_change(q, -self.rows(q)), self.descent(q)])
+            rows, slopes = self.linearised(q)
+            steps = jnp.stack([self.least_change(slopes, -rows), self.descent(rows, slopes)])
             longest = jnp.max(jnp.abs(steps / self.system.units), axis=1, keepdims=True, initial=0.0)
             steps = steps * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0))
             changes = (STEP_FRACTIONS[:, None, None] * steps).reshape(-1, steps.shape[1])
             tries = jax.vmap(lambda change: retract(self.system.topology, q, change))(changes)
             tries = jnp.concatenate([tries, q[None]])
-            sizes = jax.vmap(self.size)(tries)
+            sizes = jax.vmap(lambda q: _size(self.rows(configure(self.system, self.t, q))))(tries)
             best = jnp.argmin(sizes)
             return count + 1, tries[best], sizes[best], size
 
-        begin = (jnp.zeros((), int), q, self.size(q), jnp.asarray(jnp.inf, q.dtype))
-        return lax.while_loop(unfinished, improve, begin)[1]
+        infinite = jnp.asarray(jnp.inf, q.dtype)
+        _, q, size, _ = lax.while_loop(unfinished, improve, (jnp.zeros((), int), q, infinite, infinite))
+        return q, size
 
     def search(self, q):
         """Coordinates that meet the demand, from q, or else from beside it; the nearest miss where none do."""
@@ -220,63 +221,99 @@ class _Demand(eqx.Module):
 
         def attempt(carry):
             count, best, size = carry
-            found = self.meet(retract(self.system.topology, q, starts[count]))
-            reached = self.size(found)
+            found, reached = self.meet(retract(self.system.topology, q, starts[count]))
             return count + 1, jnp.where(reached < size, found, best), jnp.minimum(reached, size)
 
         begin = (jnp.zeros((), int), q, jnp.asarray(jnp.inf, q.dtype))
         return lax.while_loop(unfinished, attempt, begin)[1]
 
 
-def _speeds(system, t, q, held):
+def _size(rows):
+    return jnp.sqrt(jnp.sum(rows * rows))
+
+
+class _Asked(eqx.Module):
+    """Speeds that the loops and a user ask for, over `scale`: rows @ v is `right`, and v is on a branch."""
+
+    crossing: Crossing
+    rows: jax.Array
+    right: jax.Array
+    scale: jax.Array
+
+    def rest(self, v):
+        """What speeds leave over."""
+        return jnp.concatenate([self.right - self.rows @ v, -self.crossing.off_branch(v, self.scale)])
+
+    def nearest(self, v, slopes, right):
+        """The speeds nearest to v, in radians and lengths of the mechanism, with slopes @ v = right."""
+        units = self.crossing.configuration.system.units
+        inverse = invert(None, slopes, units, BALANCED.method(v.dtype).rank_tolerance)
+        metric = jnp.diag(units**-2)
+        return constrained_solve(inverse, metric, slopes, metric @ v, right)[0]
+
+    def slopes(self, v):
+        return -jax.jacfwd(self.rest)(v)
+
+    def least(self):
+        """The smallest speeds, on a branch or not."""
+        still = jnp.zeros_like(self.crossing.configuration.system.units)
+        return self.nearest(still, self.rows, self.right)
+
+    def off_branch(self, v):
+        """How far speeds are from a branch, relative to themselves."""
+        fastest = self.crossing.fastest(v)
+        off = jnp.max(jnp.abs(self.crossing.off_branch(v, self.scale)), initial=0.0)
+        return jnp.where(fastest > 0.0, off / jnp.where(fastest > 0.0, fastest, 1.0) ** 2, 0.0)
+
+
+@eqx.filter_custom_jvp
+def _on_branch(asked, v):
+    """Speeds on a branch, by Newton steps from a little beside speeds v, which may lie just between two."""
+    beside = BESIDE * jnp.sum(asked.crossing.inverse.basis, axis=1)
+    off = asked.off_branch(v) > ON_BRANCH * BALANCED.method(v.dtype).rank_tolerance
+    turn = lambda _, v: v + asked.nearest(jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
+    return lax.fori_loop(0, TURNS, turn, v + jnp.where(off, beside, 0.0))
+
+
+@_on_branch.def_jvp
+def _on_branch_jvp(primals, changes):
+    """Where nothing is left over, to any order: the Newton steps have no derivative."""
+    (asked, begin), (change, begins) = primals, changes
+    v = _on_branch(asked, begin)
+    opens = eqx.filter_jvp(lambda asked: asked.rest(v), (asked,), (change,))[1]
+    return v, asked.nearest(jnp.zeros_like(v) if begins is None else begins, asked.slopes(v), opens)
+
+
+def _speeds(configuration, held):
     """The smallest speeds with those of joints held, or near to them on a branch of the motion.
 
-    Newton steps from rest on J v = b, the speeds held, and γ(v, v) in the range of J; the first
-    leads to the smallest speeds, and where the rank of J is constant, these are on a branch.
+    Speeds satisfy J v = b, and γ(v, v) is in the range of J; where the rank of J is constant, the
+    smallest do.
 
     **Returns:** speeds, (n_v,); how far the smallest speeds are from those held, by joint; and
     how far the speeds are from such a branch, relative to themselves.
     """
-    tolerance = BALANCED.method(q.dtype).rank_tolerance
-    crossing = Crossing.at(system, t, q, tolerance)
-
-    of_joints = lambda v: held.speeds(move(crossing.configuration, v))
-    asked = jnp.concatenate([rate(system, t), *held.values])
-    largest = jnp.max(jnp.abs(asked), initial=0.0)
+    system = configuration.system
+    crossing = Crossing.of(configuration, BALANCED.method(system.dtype).rank_tolerance)
+    of_joints = lambda v: held.speeds(move(configuration, v))
+    right = jnp.concatenate([rate(system, configuration.t), *held.values])
+    largest = jnp.max(jnp.abs(right), initial=0.0)
     scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
-    still = jnp.zeros(system.topology.num_speeds, q.dtype)
+    still = jnp.zeros(system.topology.num_speeds, system.dtype)
     rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(of_joints)(still)])
-    metric = jnp.diag(system.units**-2)
-    # A little beside the smallest speeds, which may lie just between two branches.
-    beside = BESIDE * crossing.inverse.basis @ jnp.ones_like(still)
-
-    def off_branch(v):
-        fastest = crossing.fastest(v)
-        off = jnp.max(jnp.abs(crossing.off_branch(v, scale)), initial=0.0)
-        return jnp.where(fastest > 0.0, off / jnp.where(fastest > 0.0, fastest, 1.0) ** 2, 0.0)
-
-    def turn(v, first):
-        off = lambda v: crossing.off_branch(v, scale)
-        rest = jnp.concatenate([asked / scale - rows @ v, -off(v)])
-        slopes = jnp.concatenate([rows, jax.jacfwd(off)(v)])
-        inverse = invert(None, slopes, system.units, tolerance)
-        v = v + constrained_solve(inverse, metric, slopes, jnp.zeros_like(v), rest)[0]
-        return v + jnp.where(first & (off_branch(v) > ON_BRANCH * tolerance), beside, 0.0), v
-
-    v, turns = lax.scan(turn, still, jnp.arange(TURNS) == 0)
-    missed = jnp.max(jnp.abs(asked / scale - rows @ v), initial=0.0)
-    reached = zip(of_joints(scale * turns[0]), held.values, strict=True)
+    asked = _Asked(crossing, rows, right / scale, scale)
+    least = asked.least()
+    v = _on_branch(asked, least)
+    missed = jnp.max(jnp.abs(asked.right - rows @ v), initial=0.0)
+    reached = zip(of_joints(scale * least), held.values, strict=True)
     misses = Given(held.terms, tuple(found - entry for found, entry in reached))
-    return scale * v, misses, jnp.maximum(off_branch(v), missed)
+    return scale * v, misses, jnp.maximum(asked.off_branch(v), missed)
 
 
 @eqx.filter_custom_jvp
 def _found(demand, q):
     """Coordinates that meet a demand, by a search from q."""
-    q = demand.search(q)
-    # Loops that do not close stay as open as they were found.
-    met = demand.size(q) <= CLOSED
-    return retract(demand.system.topology, q, jnp.where(met, demand.least_change(q, -demand.rows(q)), 0.0))
+    return demand.search(q)
 
 
 @_found.def_jvp
@@ -284,9 +321,11 @@ def _found_jvp(primals, changes):
     """Where the rows stay zero, to any order: the search has no derivative."""
     (demand, begin), (change, _) = primals, changes
     q = _found(demand, begin)
-    opens = eqx.filter_jvp(lambda demand: demand.rows(q), (demand,), (change,))[1]
-    along = jnp.where(demand.size(q) <= CLOSED, demand.least_change(q, -opens), 0.0)
-    return q, rates(demand.system.topology, q, along)
+    at_rest = lambda demand: demand.rows(configure(demand.system, demand.t, q))
+    rows, opens = eqx.filter_jvp(at_rest, (demand,), (change,))
+    along = demand.least_change(demand.linearised(q)[1], -opens)
+    # Loops that do not close stay as open as they were found.
+    return q, rates(demand.system.topology, q, jnp.where(_size(rows) <= CLOSED, along, 0.0))
 
 
 @eqx.filter_jit
@@ -298,12 +337,14 @@ def _assemble(mechanism, positions, speeds, guess, t):
         for along, entry in zip(given.terms, given.values, strict=True):
             if along.joint in topology.coordinates:
                 q = q.at[topology.places(along)].set(entry)
-    q = _found(_Demand(system, t, positions), lax.stop_gradient(on_manifold(topology, q)))
-    v, misses, off_branch = _speeds(system, t, q, speeds)
+    demand = _Demand(system, t, positions)
+    q = _found(demand, lax.stop_gradient(on_manifold(topology, q)))
+    configuration = configure(system, t, q)
+    v, misses, off_branch = _speeds(configuration, speeds)
     remainder = _Remainder(
-        gap=gaps(configure(system, t, q)),
+        gap=gaps(configuration),
         length=system.length,
-        positions=Given(positions.terms, _Demand(system, t, positions).misses(q)),
+        positions=Given(positions.terms, demand.misses(configuration)),
         speeds=misses,
         off_branch=off_branch,
     )
