@@ -7,6 +7,7 @@ import pytest
 from known_answers import start
 
 import linkax as lx
+from linkax.scenes import SCENES
 
 
 def test_mobility_of_a_bricard_names_its_redundant_rows():
@@ -73,6 +74,41 @@ def test_derivative_of_an_equilibrium_and_of_a_frequency():
     found = jax.jacfwd(stretched)(30.0)
     np.testing.assert_allclose(found, [2.0 * 9.81 / 30.0**2, 0.5 / np.sqrt(15.0) / 2.0], rtol=1e-9)
     np.testing.assert_allclose(jax.grad(lambda k: stretched(k)[0])(30.0), found[0], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_an_equilibrium_of_a_closed_loop():
+    """Of a crank-slider with a spring, weights along the guide, against the least potential of its one angle."""
+    scene = SCENES["crank-slider"]
+    settings = scene.settings("regular", {})
+
+    def rests(numbers):
+        rod, stiffness = numbers
+        mechanism = scene.mechanism(settings | {"rod": rod})
+        forces = [lx.Gravity([-9.81, 0.0, 0.0]), lx.JointSpring("bearing", stiffness, 0.4)]
+        mechanism = lx.Mechanism(mechanism.bodies, mechanism.joints, forces)
+        return lx.equilibrium(mechanism, lx.assemble(mechanism, {"bearing": 0.3}, guess={"guide": 1.0})).q[0]
+
+    def potential(angle, numbers):
+        (rod, stiffness), crank = numbers, settings["crank"]
+        masses = [settings[name] for name in ("crank_mass", "rod_mass", "slider_mass")]
+        tip = crank * jnp.cos(angle)
+        slider = tip + jnp.sqrt(rod**2 - (crank * jnp.sin(angle)) ** 2)
+        moment = masses[0] * tip / 2 + masses[1] * (tip + slider) / 2 + masses[2] * slider
+        return 9.81 * moment + stiffness * (angle - 0.4) ** 2 / 2
+
+    at = jnp.array([settings["rod"], 10.0])
+    found = jax.jit(rests)(at)
+
+    def exact(numbers):
+        angle, slope = found, jax.grad(potential)
+        for _ in range(3):
+            angle = angle - slope(angle, numbers) / jax.grad(slope)(angle, numbers)
+        return angle
+
+    np.testing.assert_allclose(found, exact(at), rtol=1e-10)
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(rests)))(at)
+    np.testing.assert_allclose(twice, jax.jacfwd(jax.jacfwd(exact))(at), rtol=1e-8)
 
 
 def test_nothing_holds_a_falling_body():

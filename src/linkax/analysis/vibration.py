@@ -102,10 +102,17 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
 @eqx.filter_jit
 def _equilibrium(mechanism, state, t):
     system = _held_system(mechanism, state.q.dtype, t)
+    q, longest = _at_rest(system, t, lax.stop_gradient(state.q))
+    return State(q, jnp.zeros(system.topology.num_speeds, system.dtype)), longest
+
+
+@eqx.filter_custom_jvp
+def _at_rest(system, t, q):
+    """Coordinates of an equilibrium, by a search from q; and the longest part of its last step."""
     method = BALANCED.method(system.dtype)
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
 
-    def step(system, q):
+    def step(q):
         """Towards the lowest potential nearby: by the stiffness, all of whose directions count as stable."""
         tangent = _Tangent.at(system, method, t, q)
         stiffness = tangent.stiffness()
@@ -122,21 +129,30 @@ def _equilibrium(mechanism, state, t):
 
     def improve(carry):
         count, q, _ = carry
-        change, longest = step(frozen, q)
-        q, _ = method.close(frozen, t, retract(system.topology, q, change), rest)
+        change, longest = step(q)
+        q, _ = method.close(system, t, retract(system.topology, q, change), rest)
         return count + 1, q, longest
 
-    frozen = jax.tree.map(lax.stop_gradient, system)
-    start = method.close(frozen, t, lax.stop_gradient(state.q), rest)[0]
-    _, q, longest = lax.while_loop(unfinished, improve, (jnp.zeros((), int), start, jnp.asarray(jnp.inf, system.dtype)))
+    start = method.close(system, t, q, rest)[0]
+    return lax.while_loop(unfinished, improve, (jnp.zeros((), int), start, jnp.asarray(jnp.inf, system.dtype)))[1:]
 
-    # One more step, which carries the derivative: the stiffness is that of the answer, and fixed.
-    q, _ = method.close(system, t, lax.stop_gradient(q), rest)
-    tangent = _Tangent.at(system, method, t, q)
-    stiffness = lax.stop_gradient(tangent.stiffness())
-    change = tangent.basis @ (jnp.linalg.pinv(stiffness, rtol=NEUTRAL) @ tangent.acceleration(rest, rest))
-    q, _ = method.close(system, t, retract(system.topology, q, change), rest)
-    return State(q, rest), longest
+
+@_at_rest.def_jvp
+def _at_rest_jvp(primals, changes):
+    """Where the forces stay in balance, to any order: the search has no derivative."""
+    (system, t, begin), (system_change, t_change, _) = primals, changes
+    q, longest = _at_rest(system, t, begin)
+    tangent = _Tangent.at(system, BALANCED.method(system.dtype), t, q)
+    rest = jnp.zeros(system.topology.num_speeds, system.dtype)
+    acceleration = lambda system, t: dataclasses.replace(tangent, system=system, t=t).acceleration(rest, rest)
+    _, unbalanced = eqx.filter_jvp(acceleration, (system, t), (system_change, t_change))
+    change = jnp.linalg.pinv(tangent.stiffness(), rtol=NEUTRAL) @ unbalanced
+
+    def moved(system, t, y):
+        return tangent.method.close(system, t, retract(system.topology, q, tangent.basis @ y), rest)[0]
+
+    _, q_change = eqx.filter_jvp(moved, (system, t, rest), (system_change, t_change, change))
+    return (q, longest), (q_change, None)
 
 
 class Linearisation(NamedTuple):
