@@ -2,31 +2,9 @@
 
 import numpy as np
 
-from linkax.simulation.results import RESULTS
+from linkax.simulation.results import RESULTS, result_name
 from linkax.simulation.segments import TimedRun
 from linkax.simulation.solution import Solution
-
-KNOWN_RESULTS = (
-    "successful",
-    "max_steps_reached",
-    "dt_min_reached",
-    "diverged",
-    "event_occurred",
-    "not_assembled",
-    "not_closed",
-    "no_branch",
-    "not_unique",
-    "massless",
-    "not_finite",
-)
-
-
-def result_name(result) -> str:
-    """The name of a result, such as "successful" or "max_steps_reached"."""
-    for name in KNOWN_RESULTS:
-        if bool(result == getattr(RESULTS, name)):
-            return name
-    return "failed"
 
 
 def summary(run: TimedRun, points) -> dict:

@@ -32,6 +32,32 @@ class RESULTS(diffrax.RESULTS):
     not_finite = "The initial state, the numbers of the mechanism, or its forces there are not finite."
 
 
+KNOWN_RESULTS = (
+    "successful",
+    "max_steps_reached",
+    "dt_min_reached",
+    "diverged",
+    "event_occurred",
+    "not_assembled",
+    "not_closed",
+    "no_branch",
+    "not_unique",
+    "massless",
+    "not_finite",
+)
+
+
+ENDED_WELL = ("successful", "event_occurred")
+
+
+def result_name(result) -> str:
+    """The name of a result, such as "successful" or "max_steps_reached"."""
+    for name in KNOWN_RESULTS:
+        if bool(result == getattr(RESULTS, name)):
+            return name
+    return "failed"
+
+
 class SimulationError(RuntimeError):
     """A simulation that did not reach its end; `solution` holds the part computed."""
 

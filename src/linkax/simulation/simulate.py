@@ -20,7 +20,7 @@ from linkax.simulation.diagnosis import cause
 from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.outset import Outset, depart
 from linkax.simulation.replay import Course, Steps, integrate, is_replayable
-from linkax.simulation.results import RESULTS, SimulationError
+from linkax.simulation.results import ENDED_WELL, RESULTS, SimulationError, result_name
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
 
@@ -365,7 +365,7 @@ def _result(result, outset, is_adaptive):
 
 
 def _raise_if_failed(solution, state):
-    if (solution.result == RESULTS.successful) | (solution.result == RESULTS.event_occurred):
+    if result_name(solution.result) in ENDED_WELL:
         return
     at_start = ("not_finite", "not_assembled", "massless", "not_closed", "no_branch", "not_unique")
     before = any(solution.result == getattr(RESULTS, name) for name in at_start)

@@ -19,8 +19,7 @@ from linkax.formulations.shared_program import in_shared_programs
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.diagnosis import cause
-from linkax.simulation.report import result_name
-from linkax.simulation.results import RESULTS
+from linkax.simulation.results import RESULTS, result_name
 from linkax.simulation.simulate import DEFAULT_SAVES, fixed_steps, simulate
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State

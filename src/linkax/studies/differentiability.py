@@ -13,7 +13,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.loops import immobile_residual, jacobian, residual
 from linkax.equations.system import system_of
 from linkax.simulation.passages import singular_states
-from linkax.simulation.report import result_name
+from linkax.simulation.results import ENDED_WELL, result_name
 from linkax.simulation.solution import Solution
 from linkax.studies.free_parameters import FreeParameters
 
@@ -63,13 +63,13 @@ def differentiability(function: Callable, params: Any) -> Differentiability:
     solution = function(free.params(free.start))
     if not isinstance(solution, Solution):
         raise ValueError(f"the function returns {type(solution).__name__}; it must return a linkax.Solution")
-    if (name := result_name(solution.result)) not in ("successful", "event_occurred"):
+    if (name := result_name(solution.result)) not in ENDED_WELL:
         raise ValueError(f"the run ended as {name!r}: there is no motion to differentiate")
     times, states = singular_states(solution)
     reached = np.isfinite(np.asarray(solution.ts))
     ts = np.concatenate([np.asarray(solution.ts)[reached], times])
     qs = np.concatenate([np.asarray(solution.q)[reached], states])
-    rows, changes = (np.asarray(part) for part in _linearised(function, free, free.start, ts, qs))
+    rows, changes = (np.asarray(part) for part in _linearised(function, free, solution.mechanism, ts, qs))
     joints = [joint for joint, _ in row_names(solution.mechanism.topology)]
     reasons, opening = {}, [np.zeros((1, len(free.names)))]
     for index, (t, row, change) in enumerate(zip(ts, rows, changes, strict=True)):
@@ -102,8 +102,8 @@ def _unfolds(joint, t):
 
 
 @eqx.filter_jit
-def _linearised(function, free, z, ts, qs):
-    """J of all rows and their changes with z, at given coordinates: all rows in radians and lengths."""
+def _linearised(function, free, mechanism, ts, qs):
+    """J of all rows of a mechanism, and their changes with the parameters, at given coordinates."""
     dtype = qs.dtype
 
     def opened(z):
@@ -115,7 +115,7 @@ def _linearised(function, free, z, ts, qs):
 
         return jax.vmap(at)(ts, qs)
 
-    system = system_of(function(free.params(z)).mechanism, dtype)
+    system = system_of(mechanism, dtype)
     slopes = jax.vmap(lambda t, q: jacobian(configure(system, t, q)) * system.units)(ts, qs)
     still = jnp.zeros((len(ts), system.topology.num_immobile_rows, slopes.shape[-1]), dtype)
-    return jnp.concatenate([slopes, still], axis=1), jax.jacfwd(opened)(z)
+    return jnp.concatenate([slopes, still], axis=1), jax.jacfwd(opened)(free.start)

@@ -14,15 +14,14 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 
-from linkax.simulation.report import KNOWN_RESULTS
-from linkax.simulation.results import RESULTS
+from linkax.simulation.results import ENDED_WELL, KNOWN_RESULTS, RESULTS
 from linkax.studies.showing import progress_bar
 from linkax.studies.sweep_store import SweepStore
 
 DEFAULT_CHUNK = 256  # members on one device: more take no less time each
 DEFAULT_MEMORY = 2**31  # bytes
 REASONS = (*KNOWN_RESULTS, "failed", "not_finite_output", "not_run")
-FINE = [REASONS.index(name) for name in ("successful", "event_occurred")]
+FINE = [REASONS.index(name) for name in ENDED_WELL]
 NOT_FINITE_OUTPUT, NOT_RUN = (REASONS.index(name) for name in ("not_finite_output", "not_run"))
 EXPLANATIONS = {
     "failed": "failed",
