@@ -128,7 +128,6 @@ def test_compare_at_equal_cost_chooses_among_tolerances(capsys, tmp_path):
     for trial in found["trials"]:
         assert trial["verdict"] == "converged"
         assert trial["error"] < 1e-3
-        assert trial["run_s"] <= found["budget_s"] or trial["rtol"] > 1e-8
 
 
 def test_compare_tells_when_a_formulation_left_the_motion(capsys, tmp_path):

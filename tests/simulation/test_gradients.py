@@ -10,32 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import linkax as lx
+from linkax.equations.coordinates import rates
+from linkax.equations.dynamics import generalised_force
+from linkax.equations.loops import gamma
+from linkax.equations.motion import move
+from linkax.equations.system import system_of
+from linkax.formulations.formulation import coefficients
 from linkax.scenes import SCENES
 
 SCENE = SCENES["crank-slider"]
 SAVE_END = diffrax.SaveAt(t1=True)
 MASSES = ("crank_mass", "rod_mass", "slider_mass")
-
-
-def final_position(numbers, t1, adjoint=None):
-    """Where the slider of the crank-slider is at t1, of all the scene's numbers."""
-    settings = SCENE.settings("SC4", numbers)
-    mechanism = SCENE.mechanism(settings)
-    state, accuracy = SCENE.initial(mechanism, settings), lx.Accuracy(rtol=1e-12)
-    found = lx.simulate(mechanism, state, t1=t1, accuracy=accuracy, saveat=SAVE_END, adjoint=adjoint)
-    return found.position("slider")[0, 0]
-
-
-# Compiled once, for all tests here.
-POSITION = jax.jit(final_position)
-REVERSE = jax.jit(jax.grad(final_position))
-
-
-def numbers(**changes):
-    given = {"crank": 1.0, "rod": 1.0, "angle": np.pi / 3, "gravity": 9.81} | dict.fromkeys(MASSES, 1.0) | changes
-    return {name: jnp.asarray(number) for name, number in given.items()}
 
 
 class Case(NamedTuple):
@@ -52,8 +40,8 @@ class Case(NamedTuple):
         values = [value for value in settings.values() if not isinstance(value, int)]
         return jnp.asarray([*values, *np.ones(2 * len(bodies))])
 
-    def end(self, numbers, duplicated=False):
-        """Coordinates and speeds at t1."""
+    def start(self, numbers, duplicated=False):
+        """Mechanism and initial state."""
         scene = SCENES[self.scene]
         names = [name for name, value in scene.parameters.items() if not isinstance(value, int)]
         settings = dict(zip(names, numbers, strict=False)) | ({"N": self.count} if self.count else {})
@@ -67,9 +55,24 @@ class Case(NamedTuple):
         cuts = mechanism.topology.joints[mechanism.topology.num_bodies :]
         joints += [again(mechanism.joint(name)) for name in cuts if duplicated]
         mechanism = lx.Mechanism(bodies, joints, mechanism.forces, mechanism.constraints)
-        state, accuracy = scene.initial(mechanism, settings), lx.Accuracy(rtol=1e-12)
-        end = lx.simulate(mechanism, state, t1=self.t1, accuracy=accuracy, saveat=SAVE_END).end
+        return mechanism, scene.initial(mechanism, settings)
+
+    def end(self, numbers, t1, duplicated=False):
+        """Coordinates and speeds at t1."""
+        mechanism, state = self.start(numbers, duplicated)
+        end = lx.simulate(mechanism, state, t1=t1, accuracy=lx.Accuracy(rtol=1e-12), saveat=SAVE_END).end
         return jnp.concatenate([end.q, end.v])
+
+    def rates(self, numbers, t, y):
+        """q̇ and v̇ of M v̇ = f + Jᵀ (J M⁻¹ Jᵀ)⁺ (γ − J M⁻¹ f), on loops that nothing keeps closed."""
+        mechanism = self.start(numbers)[0]
+        system = system_of(mechanism, float)
+        q, v = jnp.split(y, [mechanism.topology.num_coordinates])
+        configuration, jacobian, mass = coefficients(system, t, q)
+        motion = move(configuration, v)
+        free, reach = (jnp.linalg.solve(mass, right) for right in (generalised_force(motion), jacobian.T))
+        multipliers = jnp.linalg.pinv(jacobian @ reach, rtol=1e-9, hermitian=True) @ (gamma(motion) - jacobian @ free)
+        return jnp.concatenate([rates(mechanism.topology, q, v), free + reach @ multipliers])
 
 
 def again(joint):
@@ -94,17 +97,23 @@ VARIANTS = [("crank-slider", "regular"), ("crank-slider", "SC4"), *(marked(scene
 
 @functools.cache
 def program(scene):
-    """The end of a case, and with it its Jacobian forwards, and backwards along weights of its rows."""
+    """The end of a case, and its derivatives: the Jacobian forwards, and backwards along weights of its rows."""
     end = CASES[scene].end
 
     @jax.jit
-    def derivatives(numbers):
-        value, forwards = jax.linearize(end, numbers)
-        weights = jnp.asarray(np.random.default_rng(0).normal(size=value.shape))
+    def derivatives(numbers, t1, weights):
+        _, forwards = jax.linearize(lambda numbers: end(numbers, t1), numbers)
         along = jax.linear_transpose(forwards, numbers)(weights)[0]
-        return jax.vmap(forwards, out_axes=1)(jnp.eye(len(numbers))), along, weights
+        return jax.vmap(forwards, out_axes=1)(jnp.eye(len(numbers))), along
 
     return jax.jit(end), derivatives
+
+
+def forward_derivatives(scene, numbers):
+    """Of coordinates and speeds at the end of a case."""
+    end, derivatives = program(scene)
+    t1 = CASES[scene].t1
+    return np.asarray(derivatives(numbers, t1, jnp.zeros(len(end(numbers, t1))))[0])
 
 
 def units(numbers):
@@ -125,49 +134,91 @@ def central_differences(function, at, step=3e-4):
 @pytest.mark.parametrize(("scene", "variant"), VARIANTS)
 def test_both_modes_agree_with_central_differences(scene, variant):
     """To 1e-6 of the largest derivative of the same coordinate or speed, of relative changes."""
-    at, (end, derivatives) = CASES[scene].numbers(variant), program(scene)
-    forwards, backwards, weights = (np.asarray(part) for part in derivatives(at))
+    at, t1, (end, derivatives) = CASES[scene].numbers(variant), CASES[scene].t1, program(scene)
+    weights = np.random.default_rng(0).normal(size=len(end(at, t1)))
+    forwards, backwards = (np.asarray(part) for part in derivatives(at, t1, weights))
     backwards, forwards = backwards * units(at), forwards * units(at)
     np.testing.assert_allclose(backwards, weights @ forwards, rtol=1e-9, atol=1e-9 * np.max(np.abs(backwards)))
-    off = np.abs(central_differences(end, at) - forwards) / np.max(np.abs(forwards), axis=1, keepdims=True)
+    off = np.abs(central_differences(lambda numbers: end(numbers, t1), at) - forwards) / np.max(
+        np.abs(forwards), axis=1, keepdims=True
+    )
     assert np.max(off) <= 1e-6
 
 
-@pytest.mark.parametrize("scene", [marked("bricard"), marked("rigid-crane")])
+@pytest.mark.parametrize(
+    ("scene", "variant"),
+    [
+        ("crank-slider", "regular"),
+        pytest.param("crank-slider", "SC4", marks=pytest.mark.slow),
+        *(pytest.param(scene, None, marks=pytest.mark.slow) for scene in list(CASES)[1:]),
+    ],
+)
+def test_forwards_agrees_with_integrated_sensitivities(scene, variant):
+    """To 1e-6 likewise: of the equations of motion with a pseudo-inverse, by scipy, together with their derivatives."""
+    case = CASES[scene]
+    at = case.numbers(variant)
+
+    @jax.jit
+    def of_all(t, y, to_y):
+        change = lambda to_numbers, to_y: jax.jvp(lambda p, y: case.rates(p, t, y), (at, y), (to_numbers, to_y))
+        rates, to_rates = jax.vmap(change, in_axes=(0, 1), out_axes=(None, 1))(jnp.eye(len(at)), to_y)
+        return jnp.concatenate([rates[:, None], to_rates], axis=1)
+
+    begin = lambda numbers: jnp.concatenate(jax.tree.leaves(case.start(numbers)[1]))
+    begins = np.column_stack([begin(at), jax.jit(jax.jacfwd(begin))(at)])
+
+    def flat(t, flattened):
+        both = flattened.reshape(begins.shape)
+        return np.asarray(of_all(t, both[:, 0], both[:, 1:])).ravel()
+
+    found = solve_ivp(flat, (0.0, case.t1), begins.ravel(), method="DOP853", rtol=1e-10, atol=1e-11)
+    integrated = found.y[:, -1].reshape(begins.shape)[:, 1:] * units(at)
+    forwards = forward_derivatives(scene, at) * units(at)
+    off = np.abs(integrated - forwards) / np.max(np.abs(forwards), axis=1, keepdims=True)
+    assert np.max(off) <= 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["bricard", "rigid-crane"])
 def test_duplicated_cut_joints_change_no_derivative(scene):
-    case, (_, derivatives) = CASES[scene], program(scene)
+    case = CASES[scene]
     at = case.numbers()
-    duplicated = jax.jit(jax.jacfwd(lambda numbers: case.end(numbers, duplicated=True)))(at) * units(at)
-    forwards = derivatives(at)[0] * units(at)
+    duplicated = jax.jit(jax.jacfwd(lambda numbers: case.end(numbers, case.t1, duplicated=True)))(at) * units(at)
+    forwards = forward_derivatives(scene, at) * units(at)
     np.testing.assert_allclose(duplicated, forwards, atol=1e-9 * np.max(np.abs(forwards)))
 
 
 @pytest.mark.slow
 def test_hessian_times_vector():
-    """Forwards over backwards, against differences of gradients."""
-    at, along = numbers(), {name: jnp.asarray(0.5 + index) for index, name in enumerate(numbers())}
-    slope = lambda step: REVERSE({name: at[name] + step * along[name] for name in at}, 0.5)
-    (near, back, far, beyond), step = (slope(factor * 1e-4) for factor in (1, -1, 2, -2)), 1e-4
-    product = jax.jit(lambda at: jax.jvp(lambda at: REVERSE(at, 0.5), (at,), (along,))[1])(at)
-    differences = {name: (8 * (near[name] - back[name]) - (far[name] - beyond[name])) / (12 * step) for name in at}
-    scale = max(abs(float(value)) for value in differences.values())
-    for name in at:
-        np.testing.assert_allclose(product[name], differences[name], rtol=1e-5, atol=1e-5 * scale)
+    """Forwards over backwards, against differences of gradients: of where the slider is."""
+    derivatives = program("crank-slider")[1]
+    gradient = jax.jit(lambda numbers: derivatives(numbers, 0.5, jnp.zeros(6).at[1].set(1.0))[1])
+    at = CASES["crank-slider"].numbers("SC4")
+    along = jnp.asarray(np.random.default_rng(0).normal(size=len(at)))
+    product = jax.jit(lambda at: jax.jvp(gradient, (at,), (along,))[1])(at)
+    slope, step = lambda factor: gradient(at + factor * step * along), 1e-4
+    differences = (8.0 * (slope(1) - slope(-1)) - (slope(2) - slope(-2))) / (12.0 * step)
+    np.testing.assert_allclose(product, differences, rtol=1e-5, atol=1e-5 * np.max(np.abs(differences)))
 
 
 def test_second_derivatives_forwards():
-    """Forwards twice, against backwards once and forwards once, of a pendulum."""
+    """Of a pendulum by its length l: its motion depends on t / √l alone."""
+    gravity, t1, at = 9.81, 1.0, 0.9
 
     def angle(length):
         arm = lx.rod("arm", length=length, mass=1.0)
         hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
-        mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -9.81, 0.0])])
-        return lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=1.0, saveat=SAVE_END).q[0, 0]
+        mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -gravity, 0.0])])
+        end = lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=t1, saveat=SAVE_END).end
+        return end.q[0], end.v[0]
 
-    twice = jax.jit(jax.jacfwd(jax.jacfwd(angle)))(0.9)
-    np.testing.assert_allclose(twice, jax.jit(jax.jacfwd(jax.grad(angle)))(0.9), rtol=1e-9)
+    both = jax.jit(lambda length: (angle(length), jax.jacfwd(jax.jacfwd(angle))(length)))
+    (angle_end, speed_end), (twice, _) = both(at)
+    acceleration = -1.5 * gravity / at * jnp.cos(angle_end)
+    exact = acceleration * (t1 / at) ** 2 / 4 + 0.75 * speed_end * t1 / at**2
+    np.testing.assert_allclose(twice, exact, rtol=1e-6)
     with pytest.raises(ValueError, match=r"[Rr]everse-mode"):
-        jax.grad(jax.grad(angle))(0.9)
+        jax.grad(jax.grad(lambda length: angle(length)[0]))(at)
 
 
 def test_masses_through_three_passages():
@@ -196,24 +247,27 @@ def test_masses_through_three_passages():
         )
         return 2.0 * jnp.cos(found.ys[0][0])
 
-    masses = {"crank_mass": 1.0, "rod_mass": 1.2, "slider_mass": 0.8}
-    at, values = numbers(angle=0.0, **masses), jnp.array(list(masses.values()))
-    np.testing.assert_allclose(POSITION(at, t1), reduced(values), atol=1e-9)
-    found, exact = REVERSE(at, t1), jax.jacfwd(reduced)(values)
-    for name, derivative in zip(masses, exact, strict=True):
-        np.testing.assert_allclose(found[name], derivative, rtol=1e-6)
+    names, values = list(SCENE.parameters), jnp.array([1.0, 1.2, 0.8])
+    masses, angle = np.array([names.index(name) for name in MASSES]), names.index("angle")
+    end, derivatives = program("crank-slider")
+    at = CASES["crank-slider"].numbers("SC1").at[masses].set(values).at[angle].set(0.0)
+    slider = jnp.zeros(6).at[1].set(1.0)
+    np.testing.assert_allclose(end(at, t1) @ slider, reduced(values), atol=1e-9)
+    forwards, backwards = derivatives(at, t1, slider)
+    for found in (slider @ forwards, backwards):
+        np.testing.assert_allclose(found[masses], jax.jacfwd(reduced)(values), rtol=1e-6)
 
 
 def test_masses_alone_from_a_state_that_is_given():
     """Only the forces depend on the numbers: right-hand sides of corrections have no derivative."""
 
-    def final_angle(mass):
-        settings = SCENE.settings("regular", {"rod_mass": mass})
-        mechanism = SCENE.mechanism(settings)
-        start = lx.State(jnp.array([0.0, 0.4, 0.0]), jnp.zeros(3))
-        found = lx.simulate(mechanism, start, t1=0.3, accuracy=lx.Accuracy(rtol=1e-10), saveat=SAVE_END)
-        return found.end.q[0]
+    case = CASES["crank-slider"]
+    at, place = case.numbers("regular"), list(SCENE.parameters).index("rod_mass")
+    start = case.start(at)[1]
 
-    found, step = jax.jit(jax.grad(final_angle))(0.2), 1e-4
-    difference = (jax.jit(final_angle)(0.2 + step) - jax.jit(final_angle)(0.2 - step)) / (2 * step)
-    np.testing.assert_allclose(found, difference, rtol=1e-6)
+    def final_angle(mass):
+        mechanism = case.start(at.at[place].set(mass))[0]
+        return lx.simulate(mechanism, start, t1=case.t1, accuracy=lx.Accuracy(rtol=1e-12), saveat=SAVE_END).end.q[0]
+
+    found = jax.jit(jax.grad(final_angle))(at[place])
+    np.testing.assert_allclose(found, forward_derivatives("crank-slider", at)[0, place], rtol=1e-9)
