@@ -89,6 +89,18 @@ def test_derivative_of_an_assembled_state():
     np.testing.assert_allclose(jax.grad(speed, (0, 1, 2))(*numbers), known, rtol=1e-10)
 
 
+def test_derivatives_where_only_some_arguments_are_traced():
+    speeds = jax.vmap(lambda speed: lx.assemble(crank_slider(), {"bearing": 0.7}, {"bearing": speed}).v[0])
+    np.testing.assert_allclose(speeds(jnp.arange(1.0, 3.0)), [1.0, 2.0], rtol=1e-12)
+    # What nothing holds follows the guess.
+    closed = lx.assemble(crank_slider(), {"bearing": 0.7})
+    near = lambda angle: {"bearing": angle, "guide": closed.q[1], "crank_pin": closed.q[2]}
+    slope = jax.grad(lambda angle: lx.assemble(crank_slider(), guess=near(angle)).q[0])(0.7)
+    step = 1e-4
+    found = [lx.assemble(crank_slider(), guess=near(0.7 + sign * step)).q[0] for sign in (1.0, -1.0)]
+    np.testing.assert_allclose(slope, (found[0] - found[1]) / (2 * step), rtol=1e-5)
+
+
 def test_a_search_that_is_stuck_starts_again_beside():
     """The tip has to go to where the bar points away from, a saddle of the gap."""
     bar = lx.rod("bar", 1.0, 1.0)

@@ -221,6 +221,34 @@ def test_second_derivatives_forwards():
         jax.grad(jax.grad(lambda length: angle(length)[0]))(at)
 
 
+slowly = lambda *modes: pytest.param(modes, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("modes", [(jax.jacrev,), slowly(jax.jacfwd), slowly(jax.jacfwd, jax.jacfwd)])
+def test_times_of_a_driven_joint(modes):
+    """By the end of the run and by times at which it is saved, with rows that depend on time."""
+    arm = lx.rod("arm", 1.0, 1.0)
+    hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")
+    motor = lx.Drive("motor", "hinge", jnp.sin)
+    mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -9.81, 0.0])], [motor])
+    start = lx.assemble(mechanism)
+
+    def motion(t1, saved):
+        saveat = diffrax.SaveAt(ts=saved[None], t1=True)
+        found = lx.simulate(mechanism, start, t1=t1, saveat=saveat)
+        return jnp.stack([*found.q[:, 0], *found.v[:, 0], *found.ts, found.end.q[0], found.t_end])
+
+    t1, saved = jnp.asarray(1.2), jnp.asarray(0.7)
+    expected = lambda t1, saved: jnp.stack(
+        [jnp.sin(saved), jnp.sin(t1), jnp.cos(saved), jnp.cos(t1), saved, t1, jnp.sin(t1), t1]
+    )
+    np.testing.assert_allclose(motion(t1, saved), expected(t1, saved), atol=1e-9)
+    for mode in modes:
+        motion, expected = mode(motion, (0, 1)), mode(expected, (0, 1))
+    flat = lambda tree: np.stack(jax.tree.leaves(tree))
+    np.testing.assert_allclose(flat(jax.jit(motion)(t1, saved)), flat(expected(t1, saved)), atol=1e-7)
+
+
 def test_masses_through_three_passages():
     """SC1 against the motion of the crank alone, by Lagrange's equation, differentiated as it is solved."""
     t1, gravity = 5.0, 9.81

@@ -7,14 +7,14 @@ import numpy as np
 from jax import lax
 
 from linkax.equations.configuration import configure
-from linkax.equations.coordinates import neutral, on_manifold, rates, retract
+from linkax.equations.coordinates import neutral, on_manifold, rates, retract, speeds
 from linkax.equations.loops import Gap, as_if_closed, flips, gaps, jacobian, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
 from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import constrained_solve, invert
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known
+from linkax.model.numbers import all_known
 from linkax.model.terms import Term
 from linkax.simulation.accuracy import BALANCED
 from linkax.simulation.given import Given, by_joint, coordinates_by_joint
@@ -57,6 +57,10 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     branches of the motion cross, speeds lie on the branch nearest to these; give more of them to
     choose another.
 
+    Derivatives by numbers of the mechanism, positions and speeds given, and the guess, to any order: of
+    coordinates that are not held and that the loops leave free, those of the nearest to the guess, as if
+    it closed the loops.
+
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
@@ -70,7 +74,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
     state, remainder = _assemble(mechanism, positions, speeds, guess, jnp.asarray(t, float))
-    if known(state.q) is None:
+    if not all_known((state, remainder)):
         return State(state.q, jnp.where(remainder.is_met(), state.v, jnp.inf))
     _raise_if_open(mechanism, state, t, jax.tree.map(np.asarray, remainder))
     return state
@@ -170,12 +174,6 @@ class _Demand(eqx.Module):
         closed = as_if_closed(configuration)
         return self.rows(configuration), jnp.concatenate([jacobian(closed), flips(closed)[1], *held])
 
-    def least_change(self, slopes, right):
-        """The smallest change that changes the rows by `right`, in radians and lengths of the mechanism."""
-        units = self.system.units
-        inverse = invert(None, slopes, units, BALANCED.method(slopes.dtype).rank_tolerance)
-        return constrained_solve(inverse, jnp.diag(units**-2), slopes, jnp.zeros_like(units), right)[0]
-
     def descent(self, rows, slopes):
         """The steepest descent of the rows' squares, as long as their linearisation says."""
         downhill = -(self.system.units**2) * (rows @ slopes)
@@ -196,7 +194,8 @@ class _Demand(eqx.Module):
         def improve(carry):
             count, q, size, _ = carry
             rows, slopes = self.linearised(q)
-            steps = jnp.stack([self.least_change(slopes, -rows), self.descent(rows, slopes)])
+            newton = _nearest(self.system, jnp.zeros_like(self.system.units), slopes, -rows)
+            steps = jnp.stack([newton, self.descent(rows, slopes)])
             longest = jnp.max(jnp.abs(steps / self.system.units), axis=1, keepdims=True, initial=0.0)
             steps = steps * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0))
             changes = (STEP_FRACTIONS[:, None, None] * steps).reshape(-1, steps.shape[1])
@@ -232,6 +231,13 @@ def _size(rows):
     return jnp.sqrt(jnp.sum(rows * rows))
 
 
+def _nearest(system, x, slopes, right):
+    """What is nearest to x, in radians and lengths of the mechanism, with slopes @ x = right."""
+    inverse = invert(None, slopes, system.units, BALANCED.method(x.dtype).rank_tolerance)
+    metric = jnp.diag(system.units**-2)
+    return constrained_solve(inverse, metric, slopes, metric @ x, right)[0]
+
+
 class _Asked(eqx.Module):
     """Speeds that the loops and a user ask for, over `scale`: rows @ v is `right`, and v is on a branch."""
 
@@ -244,20 +250,16 @@ class _Asked(eqx.Module):
         """What speeds leave over."""
         return jnp.concatenate([self.right - self.rows @ v, -self.crossing.off_branch(v, self.scale)])
 
-    def nearest(self, v, slopes, right):
-        """The speeds nearest to v, in radians and lengths of the mechanism, with slopes @ v = right."""
-        units = self.crossing.configuration.system.units
-        inverse = invert(None, slopes, units, BALANCED.method(v.dtype).rank_tolerance)
-        metric = jnp.diag(units**-2)
-        return constrained_solve(inverse, metric, slopes, metric @ v, right)[0]
+    @property
+    def system(self):
+        return self.crossing.configuration.system
 
     def slopes(self, v):
         return -jax.jacfwd(self.rest)(v)
 
     def least(self):
         """The smallest speeds, on a branch or not."""
-        still = jnp.zeros_like(self.crossing.configuration.system.units)
-        return self.nearest(still, self.rows, self.right)
+        return _nearest(self.system, jnp.zeros_like(self.system.units), self.rows, self.right)
 
     def off_branch(self, v):
         """How far speeds are from a branch, relative to themselves."""
@@ -271,7 +273,7 @@ def _on_branch(asked, v):
     """Speeds on a branch, by Newton steps from a little beside speeds v, which may lie just between two."""
     beside = BESIDE * jnp.sum(asked.crossing.inverse.basis, axis=1)
     off = asked.off_branch(v) > ON_BRANCH * BALANCED.method(v.dtype).rank_tolerance
-    turn = lambda _, v: v + asked.nearest(jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
+    turn = lambda _, v: v + _nearest(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
     return lax.fori_loop(0, TURNS, turn, v + jnp.where(off, beside, 0.0))
 
 
@@ -281,7 +283,7 @@ def _on_branch_jvp(primals, changes):
     (asked, begin), (change, begins) = primals, changes
     v = _on_branch(asked, begin)
     opens = eqx.filter_jvp(lambda asked: asked.rest(v), (asked,), (change,))[1]
-    return v, asked.nearest(jnp.zeros_like(v) if begins is None else begins, asked.slopes(v), opens)
+    return v, _nearest(asked.system, jnp.zeros_like(v) if begins is None else begins, asked.slopes(v), opens)
 
 
 def _speeds(configuration, held):
@@ -318,14 +320,16 @@ def _found(demand, q):
 
 @_found.def_jvp
 def _found_jvp(primals, changes):
-    """Where the rows stay zero, to any order: the search has no derivative."""
-    (demand, begin), (change, _) = primals, changes
-    q = _found(demand, begin)
+    """Where the rows stay zero, nearest to the change of where the search begins; itself it has no derivative."""
+    (demand, begin), (change, begins) = primals, changes
+    q, topology = _found(demand, begin), demand.system.topology
+    along = jnp.zeros_like(demand.system.units) if begins is None else speeds(topology, begin, begins)
     at_rest = lambda demand: demand.rows(configure(demand.system, demand.t, q))
     rows, opens = eqx.filter_jvp(at_rest, (demand,), (change,))
-    along = demand.least_change(demand.linearised(q)[1], -opens)
+    closes = jnp.zeros_like(rows) if opens is None else -opens
+    along = _nearest(demand.system, along, demand.linearised(q)[1], closes)
     # Loops that do not close stay as open as they were found.
-    return q, rates(demand.system.topology, q, jnp.where(_size(rows) <= CLOSED, along, 0.0))
+    return q, rates(topology, q, jnp.where(_size(rows) <= CLOSED, along, 0.0))
 
 
 @eqx.filter_jit
@@ -338,7 +342,7 @@ def _assemble(mechanism, positions, speeds, guess, t):
             if along.joint in topology.coordinates:
                 q = q.at[topology.places(along)].set(entry)
     demand = _Demand(system, t, positions)
-    q = _found(demand, lax.stop_gradient(on_manifold(topology, q)))
+    q = _found(demand, on_manifold(topology, q))
     configuration = configure(system, t, q)
     v, misses, off_branch = _speeds(configuration, speeds)
     remainder = _Remainder(

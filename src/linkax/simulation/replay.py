@@ -156,9 +156,8 @@ def _within(solver: Projected, t0, t1, dense, t):
 
 def _forwards(solver, every, course, steps, changes) -> Motion:
     """Tangents, step by step."""
-    zero = lambda array, change: jnp.zeros_like(array) if change is None else change
     saved, y0, last = course.saved, course.y0, steps.count - 1
-    saved_dot = None if saved is None else zero(saved, changes.saved)
+    saved_dot = None if saved is None else _zero(saved, changes.saved)
 
     def step(problem, t0, t1, y):
         return _step(solver, problem, t0, t1, y)
@@ -166,8 +165,8 @@ def _forwards(solver, every, course, steps, changes) -> Motion:
     def one(carry):
         k, j, y, motion = carry
         ends = steps.ts[k], steps.ts[k + 1]
-        begin_dot = jnp.where(k == 0, zero(course.t0, changes.t0), 0.0)
-        end_dot = jnp.where(k == last, zero(course.t1, changes.t1), 0.0)
+        begin_dot = jnp.where(k == 0, _zero(course.t0, changes.t0), 0.0)
+        end_dot = jnp.where(k == last, _zero(course.t1, changes.t1), 0.0)
         moved = changes.problem, begin_dot, end_dot, motion.end
         (y, dense), (y_dot, dense_dot) = eqx.filter_jvp(step, (course.problem, *ends, y), moved)
 
@@ -184,8 +183,8 @@ def _forwards(solver, every, course, steps, changes) -> Motion:
 
     motion = Motion(
         saved=None if saved is None else jnp.zeros((len(saved), len(y0)), y0.dtype),
-        end=zero(y0, changes.y0),
-        steps=jnp.zeros_like(steps.ys).at[0].set(zero(y0, changes.y0)) if every else None,
+        end=_zero(y0, changes.y0),
+        steps=jnp.zeros_like(steps.ys).at[0].set(_zero(y0, changes.y0)) if every else None,
     )
     begin = jnp.zeros((), int), jnp.zeros((), int), y0, motion
     return lax.while_loop(lambda carry: carry[0] < steps.count, one, begin)[-1]
@@ -231,7 +230,7 @@ def _backwards(solver, course, steps, wanted, cotangent: Motion) -> Course:
         return k - 1, j, y_bar, problem_bar, t0_bar, t1_bar, saved_bar
 
     zero = jnp.zeros((), steps.ts.dtype)
-    finish = steps.ts[jnp.maximum(steps.count, 0)]
+    finish = steps.ts[steps.count]
     count = 0 if saved is None else jnp.sum(saved <= finish)
     saved_bar = None if saved is None else jnp.zeros_like(saved)
     begin = last, count - 1, cotangent.end, jax.tree.map(jnp.zeros_like, problem), zero, zero, saved_bar
@@ -243,7 +242,7 @@ def _backwards(solver, course, steps, wanted, cotangent: Motion) -> Course:
 def integrate(course: Course, integration):
     """Run an `integration`, (course, track) -> (found, Steps or None), with the derivatives of `tangents`.
 
-    What is found has fields `ys` and `y_end`, the motion; its other fields have no derivative.
+    What is found has fields `ts` and `t_end`, `ys` and `y_end`, the motion; its other fields have no derivative.
     """
     return integration(course, False)[0]
 
@@ -267,13 +266,27 @@ def _tracked_jvp(primals, changes):
     (course, integration), (changes, _) = primals, changes
     found, steps = _tracked(course, integration)
     motion = tangents(integration.solver, course, steps, changes, every=True)
-    return (found, steps), (_change(found, integration, course, changes, motion), Steps(None, motion.steps, None))
+    begin, end = _zero(course.t0, changes.t0), _zero(course.t1, changes.t1)
+    ts = jnp.zeros_like(steps.ts).at[steps.count].set(end).at[0].set(begin)
+    return (found, steps), (_change(found, integration, course, changes, motion), Steps(ts, motion.steps, None))
+
+
+def _zero(primal, change):
+    """A change, as an array where there is none."""
+    return jnp.zeros_like(primal) if change is None else change
 
 
 def _change(found, integration, course, changes, motion):
+    """Of what is found: the end's time is t1, unless the integration ended before."""
     nothing = jax.tree.map(lambda _: None, found)
-    start = jnp.zeros_like(course.y0) if changes.y0 is None else changes.y0
-    return nothing._replace(ys=integration.rows(start, motion.saved, motion.end), y_end=motion.end[None])
+    begin, end = _zero(course.t0, changes.t0), _zero(course.t1, changes.t1)
+    saved = None if course.saved is None else _zero(course.saved, changes.saved)
+    return nothing._replace(
+        ts=integration.rows(begin, saved, end),
+        t_end=jnp.where(found.t_end == course.t1, end, 0.0),
+        ys=integration.rows(_zero(course.y0, changes.y0), motion.saved, motion.end),
+        y_end=motion.end[None],
+    )
 
 
 # As a primitive of JAX, linear in its last argument: only so can one function have a forward and a backward rule.

@@ -14,7 +14,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import formulation as named_formulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known
+from linkax.model.numbers import all_known, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.diagnosis import cause
 from linkax.simulation.integration import MechanismControl, Problem, Projected
@@ -117,7 +117,7 @@ def simulate(
         max_steps,
     )
     solution = _read(mechanism, accuracy, outset, formulation, t0, found, _saves_states(saveat))
-    if throw and known(solution.ts) is not None:
+    if throw and all_known(solution):
         _raise_if_failed(solution, state)
     return solution
 
