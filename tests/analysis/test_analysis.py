@@ -27,6 +27,23 @@ def test_mobility_in_and_beside_a_singular_configuration():
     assert beside.redundant == {"C": ("α₂", "α₃", "s₁")}
 
 
+def test_derivative_of_the_distance_from_a_singular_configuration():
+    scene = SCENES["crank-slider"]
+    settings = scene.settings("regular", {"angle": 0.6})
+
+    @jax.jit
+    def distances(rod):
+        mechanism = scene.mechanism(settings | {"rod": rod})
+        state = scene.initial(mechanism, settings | {"rod": rod})
+        here = lx.Solution.of_state(mechanism, state)
+        return jnp.stack([lx.mobility(mechanism, state).distance, here.singularity_distance()[0]])
+
+    found, step = jax.jit(jax.jacrev(distances))(0.3), 1e-5
+    differences = (distances(0.3 + step) - distances(0.3 - step)) / (2 * step)
+    assert np.all(np.abs(found) > 1e-3)
+    np.testing.assert_allclose(found, differences, rtol=1e-6)
+
+
 def hanging(length, damping):
     rod = lx.rod("rod", length, 2.0)
     hinge = lx.Revolute("hinge", lx.GROUND, rod.at("base"), "z")
@@ -74,6 +91,45 @@ def test_derivative_of_an_equilibrium_and_of_a_frequency():
     found = jax.jacfwd(stretched)(30.0)
     np.testing.assert_allclose(found, [2.0 * 9.81 / 30.0**2, 0.5 / np.sqrt(15.0) / 2.0], rtol=1e-9)
     np.testing.assert_allclose(jax.grad(lambda k: stretched(k)[0])(30.0), found[0], rtol=1e-9)
+
+
+def test_derivatives_of_modes_and_frequencies():
+    """Of two bodies on one guide, the first between wall and spring, the second behind the spring."""
+
+    def modes(masses):
+        bodies = [lx.point_mass("first", masses[0]), lx.point_mass("second", masses[1])]
+        joints = [lx.Prismatic("near", lx.GROUND, bodies[0], "x"), lx.Prismatic("far", bodies[0], bodies[1], "x")]
+        springs = [lx.JointSpring("near", 3.0, 0.0), lx.JointSpring("far", 2.0, 0.0)]
+        mechanism = lx.Mechanism(bodies, joints, springs)
+        found = lx.linearise(mechanism, lx.State(jnp.zeros(2), jnp.zeros(2)), degrees_of_freedom=2)
+        return found.natural_frequencies, jnp.abs(found.modes)
+
+    def exact(masses):
+        mass = jnp.array([[1.0, 0.0], [0.0, 0.0]]) * masses[0] + jnp.ones((2, 2)) * masses[1]
+        root = jnp.linalg.cholesky(mass)
+        flexible = jnp.linalg.solve(root, jnp.linalg.solve(root, jnp.diag(jnp.array([3.0, 2.0]))).T)
+        values, vectors = jnp.linalg.eigh((flexible + flexible.T) / 2)
+        return jnp.sqrt(values), jnp.abs(jnp.linalg.solve(root.T, vectors))
+
+    at = jnp.array([1.3, 0.7])
+    for derivative in (lambda f: f, jax.jacfwd, lambda f: jax.jacfwd(jax.jacfwd(f))):
+        for found, known in zip(jax.jit(derivative(modes))(at), derivative(exact)(at), strict=True):
+            np.testing.assert_allclose(found, known, atol=1e-9)
+
+
+@pytest.mark.parametrize("rod", [0.02, 0.3])
+def test_an_equilibrium_of_loops_that_cannot_close_is_marked(rod):
+    scene = SCENES["crank-slider"]
+    settings = scene.settings("regular", {})
+
+    @jax.jit
+    def rests(rod):
+        mechanism = scene.mechanism(settings | {"rod": rod})
+        springs = [lx.JointSpring("bearing", 30.0, 0.4), lx.JointSpring("guide", 30.0, 1.0)]
+        mechanism = lx.Mechanism(mechanism.bodies, mechanism.joints, springs)
+        return lx.equilibrium(mechanism, lx.assemble(mechanism, {"bearing": 0.4}, guess={"guide": 0.4})).q
+
+    assert np.all(np.isfinite(rests(rod))) == (rod == 0.3)
 
 
 @pytest.mark.slow

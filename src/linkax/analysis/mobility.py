@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
-from linkax.linalg.constrained_solve import least_multipliers
+from linkax.linalg.constrained_solve import least_multipliers, singularity_distance
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import Topology
 from linkax.simulation.accuracy import BALANCED, Accuracy
@@ -78,7 +78,7 @@ def mobility(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = 
 
 @eqx.filter_jit
 def _mobility(mechanism, state, t, accuracy):
-    system, topology = system_of(mechanism, state.q.dtype), mechanism.topology
+    system, topology = system_of(mechanism, state.q.dtype, fixed_units=False), mechanism.topology
     tolerance = accuracy.method(system.dtype).rank_tolerance
     crossing = Crossing.at(system, t, state.q, tolerance)
     rank, rows = jnp.sum(crossing.inverse.rank), crossing.jacobian
@@ -90,7 +90,7 @@ def _mobility(mechanism, state, t, accuracy):
         rank=rank,
         degrees_of_freedom=topology.num_speeds - rank,
         num_redundant=topology.num_rows + topology.num_immobile_rows - rank,
-        distance=crossing.inverse.distance,
+        distance=singularity_distance(None, rows, system.units, tolerance, topology.islands),
         dispensable=jnp.concatenate([dispensable, jnp.ones(topology.num_immobile_rows, bool)]),
         topology=topology,
     )

@@ -10,14 +10,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
+from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
+from linkax.equations.loops import gaps
 from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
+from linkax.linalg.constrained_solve import constrained_solve
+from linkax.linalg.triangular import cholesky_inverse_by_elimination
 from linkax.model.constraints import Coupling
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known
+from linkax.model.numbers import all_known, known
 from linkax.simulation.accuracy import BALANCED
-from linkax.simulation.assembly import LONGEST_STEP
+from linkax.simulation.assembly import CLOSED, LONGEST_STEP
 from linkax.simulation.state import State
 
 MOST_STEPS = 200
@@ -65,6 +69,20 @@ class _Tangent(eqx.Module):
         basis = departure.crossing.inverse.basis
         return _Tangent(system, method, t, q, basis, basis.T @ departure.mass)
 
+    def differentiable(self) -> "_Tangent":
+        """The same, with a basis that stays tangent and orthonormal where numbers change."""
+        departure = self.method.departure(self.system, self.t, self.q)
+        crossing, mass = departure.crossing, departure.mass
+        still = jnp.zeros(len(crossing.jacobian), mass.dtype)
+
+        def tangent(column):
+            return constrained_solve(crossing.inverse, mass, crossing.jacobian, mass @ column, still)[0]
+
+        basis = jax.vmap(tangent, in_axes=1, out_axes=1)(self.basis)
+        empty = jnp.diag((jnp.sum(self.basis**2, axis=0) == 0.0).astype(mass.dtype))
+        basis = basis @ cholesky_inverse_by_elimination(basis.T @ mass @ basis + empty)[0].T
+        return dataclasses.replace(self, basis=basis, dual=basis.T @ mass)
+
     def acceleration(self, y, y_rate):
         """ÿ."""
         q = retract(self.system.topology, self.q, self.basis @ y)
@@ -73,7 +91,7 @@ class _Tangent(eqx.Module):
 
     def stiffness(self):
         """−∂ÿ/∂y at rest."""
-        rest = jnp.zeros_like(self.basis[0])
+        rest = jnp.zeros_like(self.system.units)
         return -jax.jacfwd(self.acceleration)(rest, rest)
 
 
@@ -82,14 +100,20 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
 
     The search goes downhill, so that it ends in a stable equilibrium unless it begins exactly in
     another one. Drives hold their joints where they are at time t [s]. Differentiable with
-    respect to the numbers of the mechanism.
+    respect to the numbers of the mechanism, to any order, and not to the state where it begins.
 
-    **Raises:** `EquilibriumError` where the search does not come to rest; inside JAX
-    transformations nothing is raised, and coordinates are not finite then.
+    **Raises:** `EquilibriumError` where the search does not come to rest, or cannot close the loops; inside
+    JAX transformations nothing is raised, and coordinates are not finite then.
     """
-    found, remaining = _equilibrium(mechanism, state, jnp.asarray(t, float))
-    if known(remaining) is None:
-        return State(jnp.where(remaining <= BALANCED_STEP, found.q, jnp.nan), found.v)
+    found, remaining, gap = _equilibrium(mechanism, state, jnp.asarray(t, float))
+    if not all_known((found, remaining, gap)):
+        return State(jnp.where((remaining <= BALANCED_STEP) & (gap <= CLOSED), found.q, jnp.nan), found.v)
+    if not gap <= CLOSED:
+        raise EquilibriumError(
+            f"the loops stay open by {float(gap):.3g}, in radians or lengths of the mechanism; start from a state made "
+            "with linkax.assemble, which says which joint is open",
+            found,
+        )
     if not remaining <= BALANCED_STEP:
         raise EquilibriumError(
             f"no equilibrium near this state: step {MOST_STEPS} was still one of {float(remaining):.3g}, in radians or "
@@ -103,7 +127,10 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
 def _equilibrium(mechanism, state, t):
     system = _held_system(mechanism, state.q.dtype, t)
     q, longest = _at_rest(system, t, lax.stop_gradient(state.q))
-    return State(q, jnp.zeros(system.topology.num_speeds, system.dtype)), longest
+    loops = gaps(configure(system, t, q))
+    open_ = jnp.concatenate([loops.distance / system.length, loops.angle, loops.constraints / system.coupling_unit])
+    gap = jnp.where(jnp.all(jnp.isfinite(state.v)), jnp.max(open_, initial=0.0), jnp.inf)
+    return State(q, jnp.zeros(system.topology.num_speeds, system.dtype)), longest, gap
 
 
 @eqx.filter_custom_jvp
@@ -163,16 +190,23 @@ class Linearisation(NamedTuple):
     - `natural_frequencies`: undamped, (d,) [rad/s], rising. One that is negative is no frequency:
       its mode grows at that rate [1/s].
     - `modes`: speeds of the tree's joints in each mode, (n_v, d), of mass one.
-    - `eigenvalues`: of the motion with damping, (2d,) [1/s].
     - `basis`: (n_v, d), orthonormal in the mass metric. `stiffness`, `damping`: (d, d) [1/s², 1/s].
+
+    Differentiable, where no two frequencies are equal.
     """
 
     natural_frequencies: Float[Array, " d"]
     modes: Float[Array, "n_v d"]
-    eigenvalues: Complex[Array, " 2d"]
     basis: Float[Array, "n_v d"]
     stiffness: Float[Array, "d d"]
     damping: Float[Array, "d d"]
+
+    @property
+    def eigenvalues(self) -> Complex[Array, " 2d"]:
+        """Of the motion with damping [1/s]; with first derivatives alone."""
+        nothing = jnp.zeros_like(self.stiffness)
+        identity = nothing + jnp.eye(nothing.shape[-1])
+        return jnp.linalg.eigvals(jnp.block([[nothing, identity], [-self.stiffness, -self.damping]]))
 
 
 def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: int | None = None) -> Linearisation:
@@ -196,19 +230,17 @@ def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: 
 def _linearise(mechanism, state, t, count):
     system = _held_system(mechanism, state.q.dtype, t)
     method = BALANCED.method(system.dtype)
-    tangent, rest = _Tangent.at(system, method, t, state.q), jnp.zeros(system.topology.num_speeds, system.dtype)
+    tangent = _Tangent.at(system, method, t, state.q).differentiable()
+    rest = jnp.zeros(system.topology.num_speeds, system.dtype)
     columns = jnp.argsort(jnp.sum(tangent.basis**2, axis=0) == 0.0)[:count]
     at_columns = lambda matrix: matrix[columns[:, None], columns[None, :]]
     stiffness = at_columns(tangent.stiffness())
     damping = at_columns(-jax.jacfwd(tangent.acceleration, 1)(rest, rest))
     values, vectors = jnp.linalg.eigh((stiffness + stiffness.T) / 2.0)
-    identity, nothing = jnp.eye(count, dtype=system.dtype), jnp.zeros((count, count), system.dtype)
-    whole = jnp.block([[nothing, identity], [-stiffness, -damping]])
     basis = tangent.basis[:, columns]
     return Linearisation(
-        natural_frequencies=jnp.sign(values) * jnp.sqrt(jnp.abs(values)),
+        natural_frequencies=jnp.sign(values) * jnp.sqrt(jnp.where(values == 0.0, 1.0, jnp.abs(values))),
         modes=basis @ vectors,
-        eigenvalues=jnp.linalg.eigvals(whole),
         basis=basis,
         stiffness=stiffness,
         damping=damping,

@@ -10,6 +10,7 @@ from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
+from linkax.spatial.vectors import length as length_of
 
 
 class System(eqx.Module):
@@ -55,8 +56,12 @@ class System(eqx.Module):
         return jnp.where(self.topology.slides, self.length, jnp.ones((), self.dtype))
 
 
-def system_of(mechanism: Mechanism, dtype) -> System:
-    """Stack the numbers of a mechanism in the given floating-point type."""
+def system_of(mechanism: Mechanism, dtype, fixed_units: bool = True) -> System:
+    """Stack the numbers of a mechanism in the given floating-point type.
+
+    `fixed_units`: the lengths that are units have no derivative, since no motion depends on them. What is
+    told in them does, such as the distance from a singular configuration.
+    """
     topology, joints = mechanism.topology, mechanism.joints
 
     def stack(entries, shape):
@@ -69,7 +74,8 @@ def system_of(mechanism: Mechanism, dtype) -> System:
     parent_on_ground = (np.array(topology.parent) == GROUND_INDEX)[:, None]
     child_on_ground = (np.array(topology.child) == GROUND_INDEX)[:, None]
     center_of_mass = stack([body.center_of_mass for body in mechanism.bodies], (3,))
-    loop_length, length = _lengths(topology, *map(lax.stop_gradient, (parent_offset, child_offset, center_of_mass)))
+    fixed = lax.stop_gradient if fixed_units else lambda array: array
+    loop_length, length = _lengths(topology, *map(fixed, (parent_offset, child_offset, center_of_mass)))
     coupling = _coupling(mechanism, dtype)
     slides = jnp.where(topology.slides, length, jnp.ones((), dtype))
     return System(
@@ -86,7 +92,7 @@ def system_of(mechanism: Mechanism, dtype) -> System:
         loop_length=loop_length,
         length=length,
         coupling=coupling,
-        coupling_unit=jnp.max(jnp.abs(lax.stop_gradient(coupling)) * slides, axis=1),
+        coupling_unit=jnp.max(jnp.abs(fixed(coupling)) * slides, axis=1),
         constraints=mechanism.constraints,
         forces=mechanism.forces,
     )
@@ -105,7 +111,7 @@ def _coupling(mechanism, dtype):
 def _lengths(topology, parent_offset, child_offset, center_of_mass):
     """Half the way around each loop, and the larger of these and of the reach from ground [m]."""
     ends = jnp.concatenate([parent_offset, child_offset])  # joint j: rows j and n_j + j
-    distance = lambda pairs: jnp.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=-1)
+    distance = lambda pairs: length_of(ends[pairs[:, 0]] - ends[pairs[:, 1]])
     around = [np.array(_stations(topology, cut)).reshape(-1, 2) for cut in range(topology.num_cuts)]
     loop_length = jnp.stack([jnp.sum(distance(pairs)) / 2 for pairs in around]) if around else jnp.zeros(0, ends.dtype)
 
@@ -115,7 +121,7 @@ def _lengths(topology, parent_offset, child_offset, center_of_mass):
     far = np.where(topology.reversed, moved, moved + count)  # the end on the body itself
     carrier = np.array(topology.predecessor)
     link = jnp.where(carrier == GROUND_INDEX, 0.0, distance(np.stack([near, far[carrier]], axis=-1)))
-    to_mass = jnp.linalg.norm(center_of_mass - ends[far], axis=-1)
+    to_mass = length_of(center_of_mass - ends[far])
     reach = jnp.asarray(topology.path[:-1], ends.dtype) @ link + to_mass
     length = jnp.max(jnp.concatenate([loop_length, reach]))
     length = jnp.where(length > 0.0, length, 1.0)

@@ -23,7 +23,13 @@ from linkax.formulations.branches import Crossing
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
 from linkax.formulations.linearised import Changes, Moved, moved, unbalanced
 from linkax.formulations.passage import Course, Value, limit
-from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert_apart, with_mass
+from linkax.linalg.constrained_solve import (
+    Inverse,
+    constrained_solve,
+    invert_apart,
+    singularity_distance,
+    with_mass,
+)
 from linkax.tracing import traced_once
 
 ROUNDING_ULPS = 8.0
@@ -153,6 +159,14 @@ class TangentSpace(AbstractFormulation):
         """The configuration as a crossing of branches."""
         instant = coefficients(system, t, q)
         return Crossing(instant.configuration, instant.jacobian, self._split(instant))
+
+    def distance(self, system: System, t, q) -> Float[Array, ""]:
+        """The distance d from the nearest singular configuration, with derivatives."""
+        instant = coefficients(system, t, q)
+        weight = instant.mass if self.metric == "mass" else None
+        return singularity_distance(
+            weight, instant.jacobian, system.units, self.rank_tolerance, system.topology.islands, self.rank_nearby
+        )
 
     def departure(self, system: System, t, q) -> "Departure":
         """What decides where a motion from rest goes."""

@@ -15,7 +15,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from linkax.linalg.pivoted_qr import pivoted_qr
-from linkax.linalg.triangular import cholesky_inverse, upper_inverse
+from linkax.linalg.triangular import cholesky_inverse, cholesky_inverse_by_elimination, upper_inverse
+from linkax.spatial.vectors import length
 from linkax.tracing import traced_once
 
 
@@ -58,33 +59,21 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     weight, jacobian, units = lax.stop_gradient((weight, jacobian, units))
     rows, n = jacobian.shape
     dtype, jacobian = jacobian.dtype, jacobian * units[None, :]
-    size = jnp.sqrt(jnp.sum(jacobian**2, axis=1))
     added = jnp.zeros(rows, dtype)
     to_metric, definiteness = jnp.eye(n, dtype=dtype), jnp.ones((), dtype)
     if weight is not None:
-        weight = weight * units[:, None] * units[None, :]
-        # W = M + JᵀDJ is positive definite where M is so on the tangent space only.
-        # A row of rounding alone would add as much as any other, and is left out.
-        square = jnp.where(size > tolerance * jnp.max(size, initial=0.0), size**4, 0.0)
-        moved = jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1)
-        # A row that moves massless bodies alone takes the largest mass that there is.
-        moved = jnp.where(moved > 0.0, moved, jnp.max(jnp.diagonal(weight), initial=0.0) * size**2)
-        added = _ratio(moved, square, 0.0)
-        to_metric, definiteness = _lower_inverse(weight + (jacobian.T * added) @ jacobian)
+        metric, added = _metric(weight, jacobian, units, tolerance)
+        to_metric, definiteness = _lower_inverse(metric)
     if rows == 0:
         tangent, nothing = to_metric.T * units[:, None], jnp.zeros((n, 0), dtype)
         return Inverse(
             tangent @ tangent.T, nothing, nothing[:0], tangent, jnp.zeros((), int), jnp.ones((), dtype), definiteness
         )
 
-    weighted = to_metric @ jacobian.T
-    scale = _ratio(size, jnp.sqrt(jnp.sum(weighted**2, axis=0)), 1.0)
-    q, r, order = pivoted_qr(weighted * scale)
+    weighted, scale = _scaled(to_metric, jacobian)
+    q, r, order = pivoted_qr(weighted)
     count = min(n, rows)
-    diagonal = jnp.abs(jnp.diagonal(r))
-    active = diagonal > tolerance * jnp.maximum(diagonal[0], 1.0)
-    if rank_nearby is not None:
-        active = active & (jnp.arange(count) < rank_nearby)
+    active, distance = _independent(r, tolerance, rank_nearby)
     identity = jnp.eye(count, dtype=dtype)
     triangle = jnp.where(active[:, None] & active[None, :], r[:, :count][:count], identity)
     # Undo the permutation and the scale of the rows, and the units of the speeds.
@@ -94,18 +83,83 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     basis = units[:, None] * (to_metric.T @ q)
     is_normal = jnp.zeros(n, bool).at[:count].set(active)
     tangent = jnp.where(is_normal, 0.0, basis)
-    rank = jnp.sum(active)
-    last = (rank if rank_nearby is None else rank_nearby) - 1
-    smallest = jnp.sum(jnp.where(jnp.arange(count) == last, diagonal, 0.0))
     return Inverse(
         tangent=tangent @ tangent.T,
         normal=jnp.where(is_normal, basis, 0.0)[:, :count] @ rows_inverse.T,
         compliance=rows_inverse @ rows_inverse.T - jnp.diag(added),
         basis=tangent,
-        rank=rank,
-        distance=jnp.where(last >= 0, _ratio(smallest, diagonal[0], 0.0), 1.0),
+        rank=jnp.sum(active),
+        distance=distance,
         definiteness=definiteness,
     )
+
+
+def _metric(weight, jacobian, units, tolerance):
+    """W = M + JᵀDJ in units, positive definite where M is so on the tangent space only, and the diagonal of D."""
+    weight, size = weight * units[:, None] * units[None, :], length(jacobian)
+    # A row of rounding alone would add as much as any other, and is left out.
+    square = jnp.where(size > tolerance * jnp.max(size, initial=0.0), size**4, 0.0)
+    moved = jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1)
+    # A row that moves massless bodies alone takes the largest mass that there is.
+    moved = jnp.where(moved > 0.0, moved, jnp.max(jnp.diagonal(weight), initial=0.0) * size**2)
+    added = _ratio(moved, square, 0.0)
+    return weight + (jacobian.T * added) @ jacobian, added
+
+
+def _scaled(to_metric, jacobian):
+    """Rows of J as columns in the metric, each as long as it is in units, and by how much it was scaled."""
+    weighted = to_metric @ jacobian.T
+    scale = _ratio(length(jacobian), length(weighted, axis=0), 1.0)
+    return weighted * scale, scale
+
+
+def _independent(r, tolerance, rank_nearby):
+    """Which rows count as independent, of those chosen in order, and the distance d."""
+    diagonal = jnp.abs(jnp.diagonal(r))
+    places = jnp.arange(len(diagonal))
+    active = diagonal > tolerance * jnp.maximum(diagonal[0], 1.0)
+    if rank_nearby is not None:
+        active = active & (places < rank_nearby)
+    last = (jnp.sum(active) if rank_nearby is None else rank_nearby) - 1
+    smallest = jnp.sum(jnp.where(places == last, diagonal, 0.0))
+    return active, jnp.where(last >= 0, _ratio(smallest, diagonal[0], 0.0), 1.0)
+
+
+def singularity_distance(weight, jacobian, units, tolerance, islands, rank_nearby=None) -> Float[Array, ""]:
+    """`Inverse.distance` of `invert_apart`, with derivatives, where the pivots stay the same; none where it is zero."""
+    found = [jnp.ones((), jacobian.dtype)]
+    for index, rows, columns in by_shape(islands):
+        blocks = None if weight is None else weight[columns[:, :, None], columns[:, None, :]]
+        ranks = None if rank_nearby is None else rank_nearby[index]
+        inputs = blocks, jacobian[rows[:, :, None], columns[:, None, :]], units[columns], tolerance, ranks
+        axes = [None if blocks is None else 0, 0, 0, None, None if ranks is None else 0]
+        found.append(jnp.min(jax.vmap(_distance, in_axes=axes)(*inputs)))
+    return jnp.min(jnp.stack(found))
+
+
+def _distance(weight, jacobian, units, tolerance, rank_nearby):
+    (rows, n), jacobian = jacobian.shape, jacobian * units[None, :]
+    if rows == 0:
+        return jnp.ones((), jacobian.dtype)
+    to_metric = jnp.eye(n, dtype=jacobian.dtype)
+    if weight is not None:
+        to_metric, _ = cholesky_inverse_by_elimination(_metric(weight, jacobian, units, tolerance)[0])
+    weighted, _ = _scaled(to_metric, jacobian)
+    _, r, order = pivoted_qr(lax.stop_gradient(weighted))
+    active, found = _independent(r, tolerance, rank_nearby)
+    columns = weighted[:, order[: len(active)]]
+
+    def orthogonalise(k, carry):
+        """Column k, of length |R_kk|, taken off those after it."""
+        columns, sizes = carry
+        size = jnp.where(active[k], length(jnp.where(active[k], columns[:, k], 1.0), axis=0), 1.0)
+        along = jnp.where(active[k], columns[:, k] / size, 0.0)
+        return columns - jnp.outer(along, along @ columns), sizes.at[k].set(size)
+
+    _, sizes = lax.fori_loop(0, len(active), orthogonalise, (columns, jnp.ones(len(active), columns.dtype)))
+    last = jnp.sum(active) - 1
+    is_known = (last >= 0) & ((last + 1 == rank_nearby) if rank_nearby is not None else True)
+    return jnp.where(is_known, sizes[last] / sizes[0], found)
 
 
 def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) -> Inverse:
@@ -118,9 +172,6 @@ def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) 
     if len(islands) == 1:
         found = invert(weight, jacobian, units, tolerance, None if rank_nearby is None else rank_nearby[0])
         return found._replace(rank=found.rank[None])
-    by_shape = {}
-    for index, (rows, columns) in enumerate(islands):
-        by_shape.setdefault((len(rows), len(columns)), []).append((index, rows, columns))
     whole = Inverse(
         tangent=jnp.zeros((n, n), dtype),
         normal=jnp.zeros((n, m), dtype),
@@ -130,8 +181,7 @@ def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) 
         distance=jnp.ones((), dtype),
         definiteness=jnp.ones((), dtype),
     )
-    for members in by_shape.values():
-        index, rows, columns = (np.array(part, dtype=int) for part in zip(*members, strict=True))
+    for index, rows, columns in by_shape(islands):
         across, down, up = columns[:, None, :], columns[:, :, None], rows[:, :, None]
         blocks = None if weight is None else weight[down, across]
         ranks = None if rank_nearby is None else rank_nearby[index]
@@ -148,6 +198,14 @@ def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) 
             definiteness=jnp.minimum(whole.definiteness, jnp.min(found.definiteness)),
         )
     return whole
+
+
+def by_shape(islands):
+    """Islands of one shape together: their places among all, (k,), their rows and their columns, a line each."""
+    groups = {}
+    for index, (rows, columns) in enumerate(islands):
+        groups.setdefault((len(rows), len(columns)), []).append((index, rows, columns))
+    return [tuple(np.array(part, dtype=int) for part in zip(*members, strict=True)) for members in groups.values()]
 
 
 def with_mass(inverse: Inverse, mass) -> Inverse:

@@ -31,8 +31,8 @@ def _by_lapack(matrix):
     return solve_triangular(lower, identity, lower=True), jnp.diagonal(lower)
 
 
-def _by_elimination(matrix):
-    """Rows of [A, I] less multiples of those above: [Lᵀ, L⁻¹]."""
+def cholesky_inverse_by_elimination(matrix):
+    """`cholesky_inverse`, with derivatives: rows of [A, I] less multiples of those above, [Lᵀ, L⁻¹]."""
     n = len(matrix)
     rows = jnp.arange(n)
 
@@ -87,5 +87,5 @@ def _for_batches(single, batched):
     return function
 
 
-_cholesky_inverse = _for_batches(_by_lapack, _by_elimination)
+_cholesky_inverse = _for_batches(_by_lapack, cholesky_inverse_by_elimination)
 _upper_inverse = _for_batches(_upper_by_lapack, _upper_by_elimination)

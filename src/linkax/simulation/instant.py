@@ -145,14 +145,11 @@ class Instant(NamedTuple):
         speed = _size(self.v / units)
         return self._violated(dynamics), speed, jnp.maximum(_size(dynamics.acceleration / units), speed**2)
 
-    def _inverse(self):
-        return self.tangent_space.crossing(self.system, self.t, self.q).inverse
-
     def rank(self):
-        return jnp.sum(self._inverse().rank)
+        return jnp.sum(self.tangent_space.crossing(self.system, self.t, self.q).inverse.rank)
 
     def distance(self):
-        return self._inverse().distance
+        return self.tangent_space.distance(self.system, self.t, self.q)
 
 
 def _arm(configuration, body, point):

@@ -33,7 +33,7 @@ class Solution(eqx.Module):
     - `rank_nearby`: rank along the motion, of each part that moves independently of the others, (k,);
       in a singular configuration `rank` is smaller than their sum.
     - `closest`: smallest distance from a singular configuration at any stage of any step; one where
-      the formulation does not measure it.
+      the formulation does not measure it. Without derivative, which `singularity_distance` has.
 
     All that is read by the methods below comes as arrays with times as the first axis, in ground
     axes and SI units. A solution from `jax.vmap` has the batch axes before that.
@@ -234,7 +234,7 @@ def _over_times(function, solution, *details):
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
 
     def of_member(solution, *details):
-        system = system_of(solution.mechanism, solution.q.dtype)
+        system = system_of(solution.mechanism, solution.q.dtype, fixed_units=False)
         tangent_space = solution.accuracy.method(solution.q.dtype, solution.rank_nearby)
         method = tangent_space if solution.formulation is None else solution.formulation
         of_time = lambda t, q, v: function(Instant(system, method, tangent_space, t, q, v), *details)

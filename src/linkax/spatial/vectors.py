@@ -11,6 +11,12 @@ def dot(a, b):
     return jnp.sum(a * b, axis=-1)
 
 
+def length(a, axis=-1):
+    """Euclidean length along an axis; its derivative is zero where the length is."""
+    square = jnp.sum(a * a, axis=axis)
+    return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
+
+
 def cross(a, b):
     """Vector product along the last axis, shape (..., 3).
 
