@@ -1,5 +1,6 @@
 """What a motion has derivatives by: lengths that lock or unfold a mechanism are named, all else passes."""
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ SCENE = SCENES["crank-slider"]
 NUMBERS = {"crank": 1.0, "rod": 1.0, "rod_mass": 1.0, "gravity": 9.81, "angle": np.pi / 3}
 
 
-def crank_slider(params, t1=2.0):
+def crank_slider(params, t1=2.0, saveat=None):
     settings = SCENE.settings("SC4", params)
     mechanism = SCENE.mechanism(settings)
-    return lx.simulate(mechanism, SCENE.initial(mechanism, settings), t1=t1)
+    return lx.simulate(mechanism, SCENE.initial(mechanism, settings), t1=t1, saveat=saveat)
 
 
 def parallelogram(params):
@@ -54,6 +55,26 @@ def test_lengths_that_contradict_redundant_loops():
     assert "contradicts redundant constraints of the loop that joint 'pin_" in found.reasons["lengths[1]"]
     together = np.array([1.0, 1.0, 1.0, 0.0]) / np.sqrt(3.0)
     np.testing.assert_allclose(np.linalg.norm(together @ found.directions), 1.0, atol=1e-6)
+
+
+def test_numbers_of_an_inertia_have_one_name():
+    def motion(params):
+        body = params["inertia"]
+        link = lx.RigidBody("link", body.mass, body.center_of_mass, body.inertia)
+        mechanism = lx.Mechanism([link], [lx.Revolute("hinge", lx.GROUND, link, "z")])
+        return lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.ones(1)), t1=0.1)
+
+    inertia = lx.PhysicalInertia(1.0, [0.5, 0.0, 0.0], [0.01, 0.3, 0.3])
+    found = lx.differentiability(motion, {"inertia": inertia})
+    assert found.ok
+    assert found.names == ["inertia"] * 10
+    assert found.directions.shape == (10, 10)
+
+
+def test_saved_times_that_show_no_passage_are_refused():
+    end = lambda params: crank_slider(params, saveat=diffrax.SaveAt(t1=True))
+    with pytest.raises(ValueError, match="save more times"):
+        lx.differentiability(end, NUMBERS)
 
 
 def test_bad_input():

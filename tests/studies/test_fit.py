@@ -1,5 +1,7 @@
 """Fits: known parameters found again, their uncertainty right, and what cannot be found named."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,6 +110,19 @@ def test_physical_inertia_is_that_of_a_body():
         lx.PhysicalInertia(1.0, inertia=[1.0, 1.0, 3.0])
 
 
+@pytest.mark.parametrize("off_diagonal", [0.0, 0.1])
+def test_physical_inertia_is_found(off_diagonal):
+    """Products of inertia that are zero have no influence on the moments, but for rounding."""
+    inertia = np.array([[0.5, off_diagonal, 0.0], [off_diagonal, 0.6, 0.0], [0.0, 0.0, 0.7]])
+    residual = lambda p: (p["of"].mass - 2.0, p["of"].center_of_mass - 0.3, jnp.diagonal(p["of"].inertia - inertia))
+    start = {"of": lx.PhysicalInertia(1.0, [0.5, 0.0, 0.0], inertia)}
+    products = ", ".join(f"'of.inertia[{i}, {j}]'" for i in range(3) for j in range(3) if i != j)
+    with pytest.warns(UserWarning, match=re.escape(f"do not determine {products}: ")):
+        found = lx.fit(residual, start).params["of"]
+    for part, exact in zip(residual({"of": found}), (0.0, 0.0, 0.0), strict=True):
+        np.testing.assert_allclose(part, exact, atol=1e-9)
+
+
 def test_killed_and_resumed(tmp_path):
     """A fit that stops after three steps goes on from there, to the same numbers by the same steps."""
     args, file = (measured(2),), tmp_path / "fit.npz"
@@ -119,6 +134,25 @@ def test_killed_and_resumed(tmp_path):
     assert rest.params == whole.params
     with pytest.raises(ValueError, match="holds another fit"):
         lx.fit(lambda p: decay({"size": p["x"], "rate": 1.0}), {"x": 1.0}, checkpoint=file)
+    # Of the same names and shapes, from other starts or to other data.
+    for start, data in ((jax.tree.map(lambda x: 1.1 * x, START), args), (START, (measured(3),))):
+        with pytest.raises(ValueError, match="their start or bounds, the data"):
+            lx.fit(apart, start, data, checkpoint=file)
+
+
+def test_a_residual_by_reverse_mode_has_the_same_covariance():
+    forward, reverse = (lx.fit(apart, START, (measured(2),), mode=mode) for mode in ("forward", "reverse"))
+    np.testing.assert_allclose(reverse.covariance, forward.covariance, rtol=1e-6)
+
+
+def test_a_residual_of_one_entry_is_squared():
+    found = lx.fit(lambda p: p["x"][None] - 3.0, {"x": 1.0}, optimiser=optax.adam(0.1), steps=300)
+    np.testing.assert_allclose(found.params["x"], 3.0, atol=1e-4)
+
+
+def test_patience_with_losses_below_zero():
+    found = lx.fit(lambda p: -1.0 + 0.0 * p["x"], {"x": 1.0}, patience=5)
+    assert (found.ended, found.steps) == ("stopped early", 5)
 
 
 def test_loss_by_gradients_of_either_mode():

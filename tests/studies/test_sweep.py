@@ -16,6 +16,7 @@ import zarr
 from studies import sweep_job
 
 import linkax as lx
+from linkax.studies.sweep import REASONS
 
 JOB = Path(sweep_job.__file__)
 
@@ -99,6 +100,19 @@ def test_store_of_another_sweep(tmp_path):
     for function, params in ((jnp.cos, numbers), (jnp.sin, numbers + 1.0)):
         with pytest.raises(ValueError, match="holds another sweep"):
             lx.sweep(function, params, store=tmp_path)
+
+
+def test_of_several_results_one_that_failed_counts():
+    R = lx.RESULTS
+
+    def outcome(x):
+        later = R.where(x > 1.0, R.max_steps_reached, R.successful)
+        several = jax.vmap(lambda y: R.where(y > 3.0, R.diverged, R.successful))(jnp.stack([0.0 * x, x]))
+        return {"first": R.event_occurred, "later": later, "several": several, "x": jnp.where(x == 1.0, jnp.nan, x)}
+
+    found = lx.sweep(outcome, jnp.arange(5.0))
+    reasons = [REASONS[reason] for reason in found.reasons]
+    assert reasons == ["event_occurred", "not_finite_output", *3 * ["max_steps_reached"]]
 
 
 def test_difficulty_sorts_and_results_come_back_in_order():

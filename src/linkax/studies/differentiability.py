@@ -19,13 +19,14 @@ from linkax.studies.free_parameters import FreeParameters
 
 DEPENDENT = 1e-4  # singular values of J in radians and lengths of the mechanism: of rows that depend on others
 OPENS = 1e-3  # the part of a change of the loops that no motion takes back
+SEEN = 3.0  # times the smallest distance of any stage, above which saved times do not show it
 ROUNDING = 1e-9  # of rows, by relative changes of parameters
 
 
 class Differentiability(NamedTuple):
     """By which parameters a motion has derivatives.
 
-    - `names`: of the p numbers in `params`.
+    - `names`: of the p free numbers in `params`; those of a `PhysicalInertia` have the same one.
     - `reasons`: of each that it has no derivative by, why.
     - `directions`: changes of all parameters together that keep what is there, as orthonormal columns (p, k), each
       parameter in units of its own value.
@@ -57,7 +58,8 @@ def differentiability(function: Callable, params: Any) -> Differentiability:
     - `function`: params -> a `Solution` of one motion that went well, such as what `simulate` returns.
     - `params`: pytree of numbers and arrays, as for `linkax.fit`.
 
-    **Raises:** `ValueError` for a function that returns no `Solution`, a batch, or one of a run that failed.
+    **Raises:** `ValueError` for a function that returns no `Solution`, a batch, or one of a run that failed, and for
+    saved times too far apart to show singular configurations.
     """
     free = FreeParameters.of(params)
     solution = function(free.params(free.start))
@@ -65,13 +67,21 @@ def differentiability(function: Callable, params: Any) -> Differentiability:
         raise ValueError(f"the function returns {type(solution).__name__}; it must return a linkax.Solution")
     if (name := result_name(solution.result)) not in ENDED_WELL:
         raise ValueError(f"the run ended as {name!r}: there is no motion to differentiate")
-    times, states = singular_states(solution)
     reached = np.isfinite(np.asarray(solution.ts))
+    times, states = singular_states(solution)
+    seen = np.min(np.asarray(solution.singularity_distance())[reached], initial=1.0)
+    closest, near = float(solution.closest), float(solution.accuracy.clearance)
+    if np.sum(reached) < 2 or (len(times) == 0 and closest < near and seen > SEEN * closest):
+        raise ValueError(
+            f"the run came within {closest:.3g} of a singular configuration, its {np.sum(reached)} saved times within "
+            f"{seen:.3g}: save more times, so that singular configurations are found between them"
+        )
     ts = np.concatenate([np.asarray(solution.ts)[reached], times])
     qs = np.concatenate([np.asarray(solution.q)[reached], states])
     rows, changes = (np.asarray(part) for part in _linearised(function, free, solution.mechanism, ts, qs))
     joints = [joint for joint, _ in row_names(solution.mechanism.topology)]
-    reasons, opening = {}, [np.zeros((1, len(free.names)))]
+    names = free.free_names
+    reasons, opening = {}, [np.zeros((1, len(names)))]
     for index, (t, row, change) in enumerate(zip(ts, rows, changes, strict=True)):
         left, sizes, _ = np.linalg.svd(row)
         rank = int(np.sum(sizes > DEPENDENT * np.max(sizes, initial=1.0)))
@@ -81,10 +91,10 @@ def differentiability(function: Callable, params: Any) -> Differentiability:
         for which in np.flatnonzero(np.linalg.norm(opens, axis=0) > most):
             joint = joints[int(np.argmax(np.abs(left[:, rank:] @ opens[:, which])))]
             why = _locks(joint) if index < np.sum(reached) else _unfolds(joint, t)
-            reasons.setdefault(free.names[which], f"not differentiable: {why}")
+            reasons.setdefault(names[which], f"not differentiable: {why}")
     _, sizes, right = np.linalg.svd(np.concatenate(opening))
     directions = right[int(np.sum(sizes > OPENS * sizes[0] + ROUNDING)) :].T
-    return Differentiability(free.names, reasons, directions)
+    return Differentiability(names, reasons, directions)
 
 
 def _locks(joint):

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
-import scipy.stats
 from jax.flatten_util import ravel_pytree
 
 from linkax.simulation.files import written_whole
 from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.identity import fingerprint
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.showing import progress_bar
 from linkax.studies.uncertainty import uncertainty
@@ -67,8 +67,7 @@ class Fit(NamedTuple):
         self._known_covariance()
         if not 0.0 < level < 1.0:
             raise ValueError(f"level is {level!r}; it must lie between 0 and 1, such as 0.95")
-        freedom = max(len(self.residual) - len(self.names), 1)
-        return self.spread(float(scipy.stats.t.ppf(0.5 + level / 2.0, freedom)))
+        return self.spread(level)
 
     def _known_covariance(self):
         if self.covariance is None:
@@ -107,7 +106,7 @@ def fit(
     - `patience`: end after so many steps that gain nothing; default never for optax.
     - `mode`: "forward" or "reverse", for derivatives; default by the number of parameters. A residual uses forward
       mode.
-    - `checkpoint`: a file, written at each step, from which a fit that was killed goes on.
+    - `checkpoint`: a file, written at each step, from which the same fit goes on, killed or out of steps.
     - `progress`: show a bar; default: where someone watches.
 
     **Returns:** a `Fit`.
@@ -129,7 +128,7 @@ def fit(
     by_squares = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
     if by_squares and is_loss:
         raise ValueError("least squares need a residual; this function returns one number, so give an optax optimiser")
-    search = (_Squares if by_squares else _Descent)(optimiser, function, free, mode)
+    search = (_Squares if by_squares else _Descent)(optimiser, function, free, mode, is_loss)
     steps = DEFAULT_STEPS[kind] if steps is None else steps
     z, losses, ended = _search(search, args, steps, tolerance, patience, checkpoint, progress)
     params = jax.tree.map(np.asarray, free.params(z))
@@ -160,8 +159,11 @@ def fit(
     )
 
 
-def _linearised(function, z):
-    """A function's value and its Jacobian, forwards."""
+def _linearised(function, z, mode="forward"):
+    """A function's value and its Jacobian."""
+    if mode == "reverse":
+        value, back = jax.vjp(function, z)
+        return value, jax.vmap(back)(jnp.eye(len(value), dtype=value.dtype))[0]
     value, along = jax.linearize(function, z)
     return value, jax.vmap(along, out_axes=-1)(jnp.eye(len(z), dtype=z.dtype))
 
@@ -173,6 +175,7 @@ class _AbstractSearch(eqx.Module):
     function: Callable
     free: FreeParameters
     mode: str | None = eqx.field(static=True)
+    is_loss: bool = eqx.field(static=True)
 
     def flat(self, z, args):
         """The residual, or the loss, as a vector."""
@@ -181,7 +184,7 @@ class _AbstractSearch(eqx.Module):
 
 @eqx.filter_jit
 def _sensitivity(search, z, args):
-    return _linearised(lambda z: search.flat(z, args), z)
+    return _linearised(lambda z: search.flat(z, args), z, search.mode)
 
 
 class _Squares(_AbstractSearch):
@@ -221,7 +224,7 @@ class _Descent(_AbstractSearch):
 
         def loss(z):
             value = self.flat(z, args)
-            return value[0] if value.shape == (1,) else 0.5 * jnp.sum(value**2)
+            return value[0] if self.is_loss else 0.5 * jnp.sum(value**2)
 
         forward = len(z) <= FEW if self.mode is None else self.mode == "forward"
         value, slope = _linearised(loss, z) if forward else jax.value_and_grad(loss)(z)
@@ -245,9 +248,9 @@ def _search(search, args, steps, tolerance, patience, checkpoint, progress):
     z = search.free.start
     state = _begin(search, z, args)
     losses, best, best_z, waited = [], np.inf, z, 0
-    kept = None if checkpoint is None else _Checkpoint(Path(os.fspath(checkpoint)), search.free.names)
+    kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, state, args)
     if kept is not None and kept.path.exists():
-        (z, best_z, state), losses = kept.load((z, best_z, state))
+        (z, best_z, state), losses, waited = kept.load((z, best_z, state))
         best = min(losses)
     ended = "out of steps"
     with progress_bar(steps, "step", progress, initial=len(losses)) as bar:
@@ -263,13 +266,13 @@ def _search(search, args, steps, tolerance, patience, checkpoint, progress):
             losses.append(loss)
             # Squares tell the loss at z, descent that at the point before.
             here = z if isinstance(search, _Squares) else before
-            waited = 0 if loss < best * (1.0 - tolerance) or not np.isfinite(best) else waited + 1
+            waited = 0 if not np.isfinite(best) or loss < best - tolerance * abs(best) else waited + 1
             best, best_z = (loss, here) if loss <= best else (best, best_z)
             bar.set_description("fitting")
             bar.set_postfix(loss=f"{loss:.6g}")
             bar.update()
             if kept is not None:
-                kept.save((z, best_z, state), losses)
+                kept.save((z, best_z, state), losses, waited)
             if done:
                 ended = "converged"
                 break
@@ -287,11 +290,18 @@ class _Checkpoint(NamedTuple):
 
     path: Path
     names: list[str]
+    identity: str
 
-    def save(self, tree, losses):
+    @staticmethod
+    def of(path, search, z, state, args) -> "_Checkpoint":
+        text = _step.lower(search, z, state, args).as_text()
+        numbers = jax.tree.leaves(eqx.filter((search, z, args), eqx.is_array))
+        return _Checkpoint(Path(os.fspath(path)), search.free.names, fingerprint(text, numbers))
+
+    def save(self, tree, losses, waited):
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))]
         with written_whole(self.path) as file, open(file, "wb") as stream:
-            header = json.dumps({"names": self.names, "losses": losses})
+            header = json.dumps({"names": self.names, "fit": self.identity, "losses": losses, "waited": waited})
             np.savez(stream, header=np.array(header), **{f"leaf_{i}": leaf for i, leaf in enumerate(leaves)})
 
     def load(self, like):
@@ -300,11 +310,11 @@ class _Checkpoint(NamedTuple):
         with np.load(self.path) as file:
             header = json.loads(str(file["header"]))
             found = [file[f"leaf_{i}"] for i in range(len(file.files) - 1)]
-        same = header["names"] == self.names and [x.shape for x in found] == [jnp.shape(x) for x in leaves]
-        if not same:
+        if header.get("fit") != self.identity:
             raise ValueError(
-                f"checkpoint {str(self.path)!r} holds another fit, of {', '.join(header['names'])}; give another file, "
+                f"checkpoint {str(self.path)!r} holds another fit, of {', '.join(header['names'])} (parameters, their "
+                "start or bounds, the data, the function, the optimiser or versions have changed); give another file, "
                 "or remove this one"
             )
         found = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(found, leaves, strict=True)]
-        return eqx.combine(jax.tree.unflatten(structure, found), static), header["losses"]
+        return eqx.combine(jax.tree.unflatten(structure, found), static), header["losses"], header["waited"]

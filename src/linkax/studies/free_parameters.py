@@ -18,13 +18,14 @@ class FreeParameters(eqx.Module):
 
     - `leaves`: numbers, arrays, and parameters that are functions; `structure`: of the tree that they are leaves of.
     - `scales`: of the free numbers of each leaf.
-    - `names`: of all numbers.
+    - `names`: of all numbers; `leaf_names`.
     """
 
     leaves: list
     scales: list
     structure: Any = eqx.field(static=True)
     names: list[str] = eqx.field(static=True)
+    leaf_names: list[str] = eqx.field(static=True)
 
     @staticmethod
     def of(params) -> "FreeParameters":
@@ -43,7 +44,7 @@ class FreeParameters(eqx.Module):
                 names += _names((*path, *inner), jnp.shape(part))
         leaves = [leaf if _is_parameter(leaf) else jnp.asarray(leaf, float) for leaf in leaves]
         scales = [jnp.ones_like(leaf.free) if _is_parameter(leaf) else _magnitudes(leaf) for leaf in leaves]
-        return FreeParameters(leaves, scales, structure, names)
+        return FreeParameters(leaves, scales, structure, names, [_names(path, ())[0] for path in paths])
 
     def _starts(self):
         free = [leaf.free if _is_parameter(leaf) else leaf for leaf in self.leaves]
@@ -63,6 +64,16 @@ class FreeParameters(eqx.Module):
     def vector(self, z):
         """All numbers of `params`."""
         return ravel_pytree(self.params(z))[0]
+
+    @property
+    def free_names(self) -> list[str]:
+        """Of the entries of z: their numbers' own, or of the leaf whose numbers they make together."""
+        found, rest = [], list(self.names)
+        for of_leaf, leaf, scale in zip(self.leaf_names, self.leaves, self.scales, strict=True):
+            size = sum(jnp.size(x) for x in jax.tree.leaves(getattr(leaf, "value", leaf)))
+            own, rest = rest[:size], rest[size:]
+            found += own if size == scale.size else [of_leaf] * scale.size
+        return found
 
     @property
     def apart(self) -> np.ndarray:

@@ -5,6 +5,8 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import optimistix as optx
 
+from linkax.studies.uncertainty import NO_INFLUENCE
+
 FIRST_DAMPING = 1e-2
 LEAST_DAMPING = 1e-12
 HIGHER, LOWER = 2.0, 5.0
@@ -26,8 +28,10 @@ class _ScaledDescent(optx.AbstractDescent):
     def query(self, y, f_info, state):
         slopes = f_info.jac.as_matrix()
         largest = jnp.maximum(state[-1], jnp.linalg.norm(slopes, axis=0))
-        sizes = jnp.where(largest > 0.0, largest, 1.0)
-        left, values, right = jnp.linalg.svd(slopes / sizes, full_matrices=False)
+        # What has no influence but rounding does not move.
+        matters = largest > NO_INFLUENCE * jnp.max(largest)
+        sizes = jnp.where(matters, largest, 1.0)
+        left, values, right = jnp.linalg.svd(jnp.where(matters, slopes / sizes, 0.0), full_matrices=False)
         return right / sizes, left.T @ f_info.residual, values, largest
 
     def step(self, step_size, state):

@@ -100,10 +100,10 @@ class PhysicalInertia(AbstractParameter):
     @property
     def free(self):
         # U Uᵀ from the Cholesky factor of the matrix with its rows and columns the other way round.
-        upper = np.linalg.cholesky(_pseudo_inertia(*self.value)[::-1, ::-1])[::-1, ::-1]
+        upper = jnp.linalg.cholesky(_pseudo_inertia(*self.value)[::-1, ::-1])[::-1, ::-1]
         size = upper[3, 3]
         u = upper / size
-        return jnp.array([np.log(size), *np.log(np.diagonal(u)[:3]), u[0, 1], u[1, 2], u[0, 2], *u[:3, 3]])
+        return jnp.array([jnp.log(size), *jnp.log(jnp.diagonal(u)[:3]), u[0, 1], u[1, 2], u[0, 2], *u[:3, 3]])
 
     def value_of(self, free):
         size, *rest = free
@@ -120,9 +120,9 @@ class PhysicalInertia(AbstractParameter):
 
 def _pseudo_inertia(mass, center, inertia):
     """[[∫ r rᵀ dm, ∫ r dm], [∫ rᵀ dm, m]] about the origin of the body, (4, 4)."""
-    second = 0.5 * np.trace(inertia) * np.eye(3) - inertia + mass * np.outer(center, center)
-    first = mass * np.asarray(center)[:, None]
-    return np.block([[second, first], [first.T, np.reshape(mass, (1, 1))]])
+    second = 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia + mass * jnp.outer(center, center)
+    first = mass * jnp.asarray(center)[:, None]
+    return jnp.block([[second, first], [first.T, jnp.reshape(mass, (1, 1))]])
 
 
 def _checked(kind, value, condition, remedy):

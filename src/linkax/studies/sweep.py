@@ -108,7 +108,7 @@ def sweep(
     with progress_bar(count, "member", progress, smoothing=0.05) as bar:
         program = _Program.compiled(function, params, chunk or min(DEFAULT_CHUNK, count), memory, devices)
         bar.set_description("sweeping")
-        kept = None if store is None else SweepStore.opened(store, program, params, order)
+        kept = None if store is None else SweepStore.opened(store, program, params, order, NOT_RUN)
         found, seconds, ran = _run(program, params, order, kept, bar)
     arrays, reasons = found if jax.process_count() == 1 else _gathered(found)
     back = np.argsort(order)
@@ -148,17 +148,20 @@ def _member(function):
         arrays, _ = eqx.partition(output, eqx.is_array)
         results = [node for node in jax.tree.leaves(output, is_leaf=_is_result) if _is_result(node)]
         numbers = [leaf for leaf in jax.tree.leaves(arrays) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-        finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in numbers]).all()
-        reason = jnp.zeros((), jnp.int8) if results else jnp.where(finite, 0, NOT_FINITE_OUTPUT).astype(jnp.int8)
-        for result in results:
-            reason = jnp.where(reason == 0, _reason(result), reason)
-        return arrays, reason
+        # Beside a result, what has not been reached may be infinite.
+        spoiled = jnp.isnan if results else lambda leaf: jnp.logical_not(jnp.isfinite(leaf))
+        spoilt = jnp.array([jnp.any(spoiled(leaf)) for leaf in numbers]).any()
+        reasons = jnp.concatenate([*(jnp.ravel(_reason(result)) for result in results), jnp.zeros(1, jnp.int8)])
+        failed = jnp.logical_not(jnp.isin(reasons, jnp.array(FINE)))
+        # The first that failed, else the first.
+        reason = reasons[jnp.argmax(failed)]
+        return arrays, jnp.where(spoilt & jnp.logical_not(jnp.any(failed)), NOT_FINITE_OUTPUT, reason).astype(jnp.int8)
 
     return run
 
 
 def _reason(result):
-    found = jnp.asarray(REASONS.index("failed"), jnp.int8)
+    found = jnp.full(jnp.shape(result._value), REASONS.index("failed"), jnp.int8)
     for index, name in enumerate(KNOWN_RESULTS):
         found = jnp.where(result == getattr(RESULTS, name), index, found).astype(jnp.int8)
     return found
@@ -182,7 +185,7 @@ class _Program(NamedTuple):
         """How many chunks are computed at once.
 
         Calls of LAPACK for batches, from programs that run at once on a CPU, may wait for each other for ever
-        (jaxlib 0.10: they wait for threads of the pool that they run in). linkax itself makes none in a batch.
+        (jaxlib 0.10: they wait for threads of the pool that they run in). A simulation makes none in a batch.
         """
         if jax.default_backend() != "cpu":
             return 2  # one is computed while the results of another are copied

@@ -1,6 +1,5 @@
 """Results of a sweep on disk, as they come."""
 
-import hashlib
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +9,7 @@ import numpy as np
 import zarr
 from jax.experimental import multihost_utils
 
+from linkax.studies.identity import fingerprint
 from linkax.studies.showing import path_parts
 
 FORMAT = 1
@@ -25,28 +25,40 @@ class SweepStore(NamedTuple):
     size: int
 
     @staticmethod
-    def opened(path, program, params, order) -> "SweepStore":
-        """A new store, or the one that is there.
+    def opened(path, program, params, order, not_run) -> "SweepStore":
+        """A new store, whose reasons are all `not_run`, or the one that is there.
 
-        **Raises:** `ValueError` where it holds another sweep.
+        **Raises:** `ValueError` where it holds another sweep, or something else.
         """
         path, count = Path(os.fspath(path)), len(order)
-        identity = dict(format=FORMAT, members=count, chunk=program.size, sweep=_identity(program, params, order))
+        sweep = fingerprint(program.text, [*jax.tree.leaves(params), order])
+        identity = dict(format=FORMAT, members=count, chunk=program.size, sweep=sweep)
         first = jax.process_index() == 0
         outputs, reason = program.outputs
         names = ["reason", *_names("output", outputs)]
         infos = [reason, *jax.tree.leaves(outputs)]
         if first and not (path / "zarr.json").exists():
-            group = zarr.open_group(path, mode="w-" if not path.exists() else "a")
+            if path.exists() and (not path.is_dir() or any(path.iterdir())):
+                raise ValueError(f"store {str(path)!r} holds something else than a sweep; give another folder")
+            # Aside, and then moved in one piece: a store that is there is whole.
+            aside = path.with_name(f".unfinished-{path.name}")
+            group = zarr.open_group(aside, mode="w")
             for name, info in zip(names, infos, strict=True):
-                shape = (count, *info.shape[1:])
-                group.create_array(name, shape=shape, chunks=(program.size, *info.shape[1:]), dtype=info.dtype)
+                fill = not_run if name == "reason" else np.nan if np.issubdtype(info.dtype, np.inexact) else 0
+                group.create_array(
+                    name,
+                    shape=(count, *info.shape[1:]),
+                    chunks=(program.size, *info.shape[1:]),
+                    dtype=info.dtype,
+                    fill_value=fill,
+                )
             for name, leaf in zip(_names("params", params), jax.tree.leaves(params), strict=True):
                 group.create_array(name, data=np.asarray(leaf))
             group.create_array("member", data=order)
             chunks = -(-count // program.size)
             group.create_array("done", shape=(chunks,), chunks=(1,), dtype=np.int8, fill_value=0)
             group.attrs.update(identity)
+            aside.replace(path)
         _wait()
         group = zarr.open_group(path, mode="r+")
         other = {name: group.attrs.get(name) for name in identity}
@@ -80,13 +92,6 @@ def _names(prefix, tree: Any) -> list[str]:
     """Paths of a tree's leaves as names of arrays."""
     paths = [path for path, _ in jax.tree.leaves_with_path(tree)]
     return ["/".join([prefix, *path_parts(path)]) if path else f"{prefix}/value" for path in paths]
-
-
-def _identity(program, params, order) -> str:
-    digest = hashlib.sha256(program.text.encode())
-    for leaf in [*jax.tree.leaves(params), order]:
-        digest.update(np.ascontiguousarray(leaf).tobytes())
-    return digest.hexdigest()
 
 
 def _wait():

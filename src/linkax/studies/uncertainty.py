@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.stats
 from jax.flatten_util import ravel_pytree
 
 from linkax.linalg.pivoted_qr import pivoted_qr
@@ -19,7 +20,7 @@ class Uncertainty(NamedTuple):
     """Covariance of all parameters, and what cannot be told of them.
 
     - `covariance`, `noise`, `undetermined`: see `linkax.Fit`.
-    - `spread`: number of standard deviations -> ends of the intervals, in the structure of the parameters.
+    - `spread`: level of confidence -> ends of the intervals, in the structure of the parameters.
     """
 
     covariance: np.ndarray
@@ -42,7 +43,8 @@ def uncertainty(residual, slopes, free, z) -> Uncertainty:
     inverse = np.linalg.inv(r[:rank, :rank]) if rank else np.zeros((0, 0))
     rows = order[:rank]
     to_free[np.ix_(rows, rows)] = inverse @ inverse.T / np.outer(scale[rows], scale[rows])
-    noise = float(np.sqrt(residual @ residual / max(count - rank, 1)))
+    freedom = max(count - rank, 1)
+    noise = float(np.sqrt(residual @ residual / freedom))
     # Changes that the residual does not see: of one parameter that is left over, and what makes up for it.
     unseen = np.zeros((size, size - rank))
     unseen[order[:rank]] = -inverse @ r[:rank, rank:]
@@ -50,14 +52,19 @@ def uncertainty(residual, slopes, free, z) -> Uncertainty:
     lost = np.any(np.abs(unseen) > INVOLVED, axis=1)
     slopes_of_params = np.asarray(jax.jacfwd(free.vector)(z))
     covariance = noise**2 * slopes_of_params @ to_free @ slopes_of_params.T
-    undetermined = np.any(np.abs(slopes_of_params[:, lost]) > 0.0, axis=1)
+    depends = np.abs(slopes_of_params)
+    depends = np.where(depends > NO_INFLUENCE * np.max(depends, axis=1, keepdims=True), slopes_of_params, 0.0)
+    # A number is free where what it depends on is, and does not cancel.
+    each = np.abs(depends) @ np.where(np.abs(unseen) > INVOLVED, np.abs(unseen) / scale[:, None], 0.0)
+    together = np.abs(depends @ (unseen / scale[:, None]))
+    undetermined = np.any((each > 0.0) & (together > INVOLVED * each), axis=1)
     covariance[undetermined, undetermined] = np.inf
     deviation = noise * np.sqrt(np.where(lost, np.inf, np.diagonal(to_free)))
     _, unravel = ravel_pytree(free.params(z))
 
-    def spread(times):
-        """Ends of intervals of so many standard deviations."""
-        ends = []
+    def spread(level):
+        """Ends of the intervals, from Student's t distribution."""
+        times, ends = float(scipy.stats.t.ppf(0.5 + level / 2.0, freedom)), []
         for sign in (-1.0, 1.0):
             linear = np.asarray(free.vector(z)) + sign * times * np.sqrt(np.diagonal(covariance))
             moved = np.asarray(free.vector(z + sign * times * deviation))
