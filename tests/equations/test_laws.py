@@ -180,6 +180,7 @@ def test_far_from_the_origin_nothing_is_lost():
         np.testing.assert_allclose(there[what][0], here[what][0], rtol=1e-12, atol=1e-13, err_msg=what)
 
 
+@pytest.mark.slow
 def test_reactions_do_not_depend_on_the_tree():
     """A spatial loop with a redundant row at one state, each joint cut in turn: what is unique is the same."""
     mechanism, state = start("bricard", changes={"angle": 0.9, "speed": 2.0})

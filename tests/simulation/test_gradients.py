@@ -90,7 +90,7 @@ CASES = {
     "spatial-four-link": Case("spatial-four-link", 1.0),
     "rigid-crane": Case("rigid-crane", 0.5),
 }
-SLOW = ("n-four-bar", "spatial-four-link", "rigid-crane")
+SLOW = ("bricard", "n-four-bar", "spatial-four-link", "rigid-crane")
 marked = lambda scene, *more: pytest.param(scene, *more, marks=[pytest.mark.slow] if scene in SLOW else [])
 VARIANTS = [("crank-slider", "regular"), ("crank-slider", "SC4"), *(marked(scene, None) for scene in list(CASES)[1:])]
 

@@ -56,7 +56,7 @@ def test_every_joint_type_passes_singular_configurations(name):
     assert found.closest < 0.05
 
 
-@pytest.mark.parametrize("carrier", [lx.Planar, lx.Free])
+@pytest.mark.parametrize("carrier", [pytest.param(lx.Planar, marks=pytest.mark.slow), lx.Free])
 def test_two_loops_that_share_a_coupler_are_singular_at_once(carrier):
     """The coupler is carried from ground, and both its pins are cut."""
     along = np.array([1.0, 0.0, 0.0])
@@ -82,6 +82,7 @@ def test_two_loops_that_share_a_coupler_are_singular_at_once(carrier):
     assert found.closest < 0.05
 
 
+@pytest.mark.slow
 def test_ten_cut_joints_move_like_one():
     kinds = (lx.Revolute,) * 4
     mechanism, state = rhombus(*kinds, copies=10, speed=-1.0, gravity=9.81)
@@ -113,6 +114,7 @@ def test_free_rigid_body_keeps_energy_and_angular_momentum_over_a_hundred_turns(
     np.testing.assert_allclose(np.linalg.norm(found.q[:, :4], axis=-1), 1.0, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_massless_rod_makes_a_pendulum_of_a_free_body():
     body = lx.RigidBody("bob", 1.0, inertia=[1e-3, 1e-3, 1e-3])
     rod = lx.Distance("rod", lx.GROUND, body, 1.0)
