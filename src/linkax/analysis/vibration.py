@@ -69,19 +69,21 @@ class _Tangent(eqx.Module):
         basis = departure.crossing.inverse.basis
         return _Tangent(system, method, t, q, basis, basis.T @ departure.mass)
 
-    def differentiable(self) -> "_Tangent":
+    @staticmethod
+    def differentiable(system, method, t, q) -> "_Tangent":
         """The same, with a basis that stays tangent and orthonormal where numbers change."""
-        departure = self.method.departure(self.system, self.t, self.q)
+        departure = method.departure(system, t, q)
         crossing, mass = departure.crossing, departure.mass
+        fixed = crossing.inverse.basis
         still = jnp.zeros(len(crossing.jacobian), mass.dtype)
 
         def tangent(column):
             return constrained_solve(crossing.inverse, mass, crossing.jacobian, mass @ column, still)[0]
 
-        basis = jax.vmap(tangent, in_axes=1, out_axes=1)(self.basis)
-        empty = jnp.diag((jnp.sum(self.basis**2, axis=0) == 0.0).astype(mass.dtype))
+        basis = jax.vmap(tangent, in_axes=1, out_axes=1)(fixed)
+        empty = jnp.diag((jnp.sum(fixed**2, axis=0) == 0.0).astype(mass.dtype))
         basis = basis @ cholesky_inverse_by_elimination(basis.T @ mass @ basis + empty)[0].T
-        return dataclasses.replace(self, basis=basis, dual=basis.T @ mass)
+        return _Tangent(system, method, t, q, basis, basis.T @ mass)
 
     def acceleration(self, y, y_rate):
         """ÿ."""
@@ -230,7 +232,7 @@ def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: 
 def _linearise(mechanism, state, t, count):
     system = _held_system(mechanism, state.q.dtype, t)
     method = BALANCED.method(system.dtype)
-    tangent = _Tangent.at(system, method, t, state.q).differentiable()
+    tangent = _Tangent.differentiable(system, method, t, state.q)
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
     columns = jnp.argsort(jnp.sum(tangent.basis**2, axis=0) == 0.0)[:count]
     at_columns = lambda matrix: matrix[columns[:, None], columns[None, :]]

@@ -127,14 +127,8 @@ def _independent(r, tolerance, rank_nearby):
 
 def singularity_distance(weight, jacobian, units, tolerance, islands, rank_nearby=None) -> Float[Array, ""]:
     """`Inverse.distance` of `invert_apart`, with derivatives, where the pivots stay the same; none where it is zero."""
-    found = [jnp.ones((), jacobian.dtype)]
-    for index, rows, columns in by_shape(islands):
-        blocks = None if weight is None else weight[columns[:, :, None], columns[:, None, :]]
-        ranks = None if rank_nearby is None else rank_nearby[index]
-        inputs = blocks, jacobian[rows[:, :, None], columns[:, None, :]], units[columns], tolerance, ranks
-        axes = [None if blocks is None else 0, 0, 0, None, None if ranks is None else 0]
-        found.append(jnp.min(jax.vmap(_distance, in_axes=axes)(*inputs)))
-    return jnp.min(jnp.stack(found))
+    each = _over_islands(_distance, weight, jacobian, units, tolerance, islands, rank_nearby)
+    return jnp.min(jnp.concatenate([jnp.ones(1, jacobian.dtype), *(found for *_, found in each)]))
 
 
 def _distance(weight, jacobian, units, tolerance, rank_nearby):
@@ -181,13 +175,8 @@ def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) 
         distance=jnp.ones((), dtype),
         definiteness=jnp.ones((), dtype),
     )
-    for index, rows, columns in by_shape(islands):
+    for index, rows, columns, found in _over_islands(invert, weight, jacobian, units, tolerance, islands, rank_nearby):
         across, down, up = columns[:, None, :], columns[:, :, None], rows[:, :, None]
-        blocks = None if weight is None else weight[down, across]
-        ranks = None if rank_nearby is None else rank_nearby[index]
-        inputs = blocks, jacobian[up, across], units[columns], tolerance, ranks
-        axes = [None if blocks is None else 0, 0, 0, None, None if ranks is None else 0]
-        found = jax.vmap(invert, in_axes=axes)(*inputs)
         whole = Inverse(
             tangent=whole.tangent.at[down, across].set(found.tangent),
             normal=whole.normal.at[down, rows[:, None, :]].set(found.normal),
@@ -200,12 +189,19 @@ def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) 
     return whole
 
 
-def by_shape(islands):
-    """Islands of one shape together: their places among all, (k,), their rows and their columns, a line each."""
+def _over_islands(function, weight, jacobian, units, tolerance, islands, rank_nearby):
+    """A function of each island, of those of one shape together: their places, rows and columns, and what it gives."""
     groups = {}
     for index, (rows, columns) in enumerate(islands):
         groups.setdefault((len(rows), len(columns)), []).append((index, rows, columns))
-    return [tuple(np.array(part, dtype=int) for part in zip(*members, strict=True)) for members in groups.values()]
+    for members in groups.values():
+        index, rows, columns = (np.array(part, dtype=int) for part in zip(*members, strict=True))
+        across, down, up = columns[:, None, :], columns[:, :, None], rows[:, :, None]
+        blocks = None if weight is None else weight[down, across]
+        ranks = None if rank_nearby is None else rank_nearby[index]
+        inputs = blocks, jacobian[up, across], units[columns], tolerance, ranks
+        axes = [None if blocks is None else 0, 0, 0, None, None if ranks is None else 0]
+        yield index, rows, columns, jax.vmap(function, in_axes=axes)(*inputs)
 
 
 def with_mass(inverse: Inverse, mass) -> Inverse:
