@@ -154,9 +154,35 @@ def _restoring(factor, t, motion):
     return -factor * motion.joint("table")[0] * jnp.cos(t) + motion.joint_speed("slide")
 
 
+def bending(seed):
+    """Two beams in a loop, one held by its tip: attachments along and off their axes, and a sleeve that slides."""
+    numbers = Numbers(seed)
+    pair = lambda: jnp.array([numbers.positive(), numbers.positive()])
+    section = lambda: lx.Section(pair(), numbers.positive(), numbers.positive(), numbers.positive(), pair())
+    every = lx.Beam("every", numbers.positive(), section(), elements=2, shear=True)
+    slender = lx.Beam("slender", numbers.positive(), section(), elements=1, bends="z", torsion=False)
+    body, sleeve = numbers.body("body"), lx.point_mass("sleeve", numbers.positive())
+    along = lambda beam, *off: beam.at(jnp.array([0.6 * beam.length, *off]))
+    joints = [
+        numbers.joint(lx.Revolute, "hinge", body, lx.GROUND),
+        lx.Fixed("weld", body, every.at("tip")),
+        lx.Universal("cardan", every.at("base"), along(slender, 0.1, 0.2), axis="y"),
+        lx.Sliding("slide", every, sleeve),
+        lx.Spherical("ball", sleeve, slender.at("tip"), cut=True),
+    ]
+    forces = [
+        GRAVITY,
+        lx.Spring(along(every, 0.0, 0.0), lx.GROUND, 2.0, 0.3),
+        lx.JointSpring("slide", 1.5, 0.2),
+        lx.PointForce(every.at("base"), [1.0, 2.0, 3.0], axes="frame"),
+    ]
+    return lx.Mechanism([every, slender, body, sleeve], joints, forces)
+
+
 POOL = {
     "planar": lambda seed: crank_slider(rod=1.0 + Numbers(seed).positive()),
     **{kind.__name__: lambda seed, kind=kind: both_roles(kind, seed) for kind in KINDS},
     "floating": floating,
     "driven": driven,
+    "bending": bending,
 }

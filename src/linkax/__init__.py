@@ -29,6 +29,7 @@ from linkax.formulations.moore_penrose import MoorePenrose as MoorePenrose  # no
 from linkax.formulations.projection_operator import ProjectionOperator as ProjectionOperator  # noqa: E402
 from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402
 from linkax.linalg.pivoted_qr import pivoted_qr as pivoted_qr  # noqa: E402
+from linkax.model.beams import Beam as Beam  # noqa: E402
 from linkax.model.bodies import GROUND as GROUND  # noqa: E402
 from linkax.model.bodies import Frame as Frame  # noqa: E402
 from linkax.model.bodies import RigidBody as RigidBody  # noqa: E402
@@ -46,7 +47,9 @@ from linkax.model.forces import JointSpring as JointSpring  # noqa: E402
 from linkax.model.forces import JointTorque as JointTorque  # noqa: E402
 from linkax.model.forces import Load as Load  # noqa: E402
 from linkax.model.forces import PointForce as PointForce  # noqa: E402
+from linkax.model.forces import PointMoment as PointMoment  # noqa: E402
 from linkax.model.forces import Spring as Spring  # noqa: E402
+from linkax.model.joints.bending import Sliding as Sliding  # noqa: E402
 from linkax.model.joints.cylindrical import Cylindrical as Cylindrical  # noqa: E402
 from linkax.model.joints.distance import Distance as Distance  # noqa: E402
 from linkax.model.joints.fixed import Fixed as Fixed  # noqa: E402
@@ -59,6 +62,10 @@ from linkax.model.joints.screw import Screw as Screw  # noqa: E402
 from linkax.model.joints.spherical import Spherical as Spherical  # noqa: E402
 from linkax.model.joints.universal import Universal as Universal  # noqa: E402
 from linkax.model.mechanism import Mechanism as Mechanism  # noqa: E402
+from linkax.model.sections import Material as Material  # noqa: E402
+from linkax.model.sections import Section as Section  # noqa: E402
+from linkax.model.sections import circle as circle  # noqa: E402
+from linkax.model.sections import rectangle as rectangle  # noqa: E402
 from linkax.model.terms import Term as Term  # noqa: E402
 from linkax.simulation.accuracy import BALANCED as BALANCED  # noqa: E402
 from linkax.simulation.accuracy import DRAFT as DRAFT  # noqa: E402

@@ -17,11 +17,12 @@ from mechanisms import POOL, crank_slider, with_cut
 
 import linkax as lx
 from linkax.equations import dynamics, loops
-from linkax.equations.configuration import bodies_of_cuts, configure
+from linkax.equations.configuration import bodies_of_cuts, by_speed_of, configure
 from linkax.equations.coordinates import neutral, on_manifold, rates, retract
 from linkax.equations.motion import move
 from linkax.equations.reactions import cut_reactions, reactions, seen_from
 from linkax.equations.system import system_of
+from linkax.model.beams import BeamElasticity
 from linkax.spatial.vectors import cross
 
 SIDES = ("child", "parent")
@@ -103,9 +104,14 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     power += jnp.sum(cut.moment * (motion.angular_velocity[child] - motion.angular_velocity[parent]))
     of_coordinates = multipliers[topology.num_rows - len(system.constraints) :]
     asked = (system.coupling / system.coupling_unit[:, None]).T @ of_coordinates
-    body = topology.column_body
+    body = topology.moved_body
     sign = jnp.where(topology.reversed[body], -1.0, 1.0)[:, None]
     left = jnp.sum(sign * (every.force[body] * configuration.sliding + every.moment[body] * configuration.angular), -1)
+    left = by_speed_of(topology, left)
+    # Of a joint that bends the reaction has the joint's own forces in it.
+    bends = np.array([topology.joint_types[body].motion is not None for body, _ in topology.motions])
+    own = np.isin(np.arange(topology.num_speeds), topology.motions[bends, 1])
+    left = left - jnp.where(own, load.joint_force + asked, 0.0)
     # On the parent, at its own frame: both sides of a joint balance about the world's origin.
     on_parents = seen_from(configuration, every, "parent", "ground")
     places = [jnp.stack([configuration.point(getattr(joint, side)) for joint in mechanism.joints]) for side in SIDES]
@@ -117,7 +123,9 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     solved = jnp.linalg.solve(mass, force + jacobian.T @ multipliers)
     energy = along(lambda t, q, v: kinetic_energy(system, t, q, v), solved)
     stored = along(lambda t, q, v: dynamics.potential_energy(configure(system, t, q)), solved)
-    storing = [force for force in system.forces if isinstance(force, (lx.Gravity, lx.Spring, lx.JointSpring))]
+    storing = [
+        force for force in system.forces if isinstance(force, (lx.Gravity, lx.Spring, lx.JointSpring, BeamElasticity))
+    ]
     loads = reduce(lx.Load.plus, [force.load(t, motion) for force in storing], lx.Load.none(system))
     released = loads.joint_force + dynamics.along_speeds(configuration, loads.force, loads.moment)
     momenta = jnp.concatenate(along(lambda t, q, v: momentum(system, t, q, v), solved))

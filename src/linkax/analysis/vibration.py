@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
+from linkax.equations.dynamics import generalised_force
 from linkax.equations.loops import gaps
+from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
@@ -20,14 +22,19 @@ from linkax.linalg.triangular import cholesky_inverse_by_elimination
 from linkax.model.constraints import Coupling
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import all_known, known
-from linkax.simulation.accuracy import BALANCED
+from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.assembly import CLOSED, LONGEST_STEP
 from linkax.simulation.state import State
 
 MOST_STEPS = 200
 AT_REST = 1e-12  # step [rad, lengths of the mechanism] below which the search for an equilibrium ends
 BALANCED_STEP = 1e-8  # the same, above which it has failed
+OVERSHOOT = 0.5  # of the work on a step, which forces may do against it at its end
 NEUTRAL = 1e-12  # stiffness relative to the largest that counts as none
+
+
+# Mechanisms at rest need no mass, and forces differ less between soft and stiff directions than accelerations do.
+_STATICS = Accuracy(metric="identity")
 
 
 class EquilibriumError(RuntimeError):
@@ -49,11 +56,11 @@ def _held_system(mechanism, dtype, t) -> System:
     return dataclasses.replace(system, constraints=tuple(held))
 
 
-class _Tangent(eqx.Module):
+class _Nearby(eqx.Module):
     """A mechanism near closed coordinates q, in coordinates y of the tangent space: q ⊕ T y.
 
-    - `basis`: T, (n_v, n_v), columns orthonormal in the mass metric, zero where there is no tangent;
-      `dual`: TᵀM, its inverse on the tangent space.
+    - `basis`: T, (n_v, n_v), columns orthonormal in a metric, zero where there is no tangent; `dual`: its inverse
+      on the tangent space.
     """
 
     system: System
@@ -63,15 +70,45 @@ class _Tangent(eqx.Module):
     basis: Float[Array, "n_v n_v"]
     dual: Float[Array, "n_v n_v"]
 
-    @staticmethod
-    def at(system, method, t, q) -> "_Tangent":
-        departure = lax.stop_gradient(method.departure(system, t, q))
-        basis = departure.crossing.inverse.basis
-        return _Tangent(system, method, t, q, basis, basis.T @ departure.mass)
+    def at(self, y):
+        """Coordinates q."""
+        return retract(self.system.topology, self.q, self.basis @ y)
+
+    def slopes(self, function):
+        """A function of y at zero, and its derivative."""
+        rest = jnp.zeros_like(self.system.units)
+        follow = lambda change: jax.jvp(function, (rest,), (change,))
+        return jax.vmap(follow, out_axes=(None, 1))(jnp.eye(len(rest), dtype=rest.dtype))
+
+
+class _Still(_Nearby):
+    """Held at rest: forces, and no masses. The metric is that of radians and lengths of the mechanism."""
 
     @staticmethod
-    def differentiable(system, method, t, q) -> "_Tangent":
-        """The same, with a basis that stays tangent and orthonormal where numbers change."""
+    def of(system, method, t, q) -> "_Still":
+        basis = lax.stop_gradient(method.crossing(system, t, q).inverse.basis)
+        return _Still(system, method, t, q, basis, basis.T / system.units**2)
+
+    def force(self, y):
+        """What the forces do along y, less what the loops take."""
+        rest, units = jnp.zeros_like(self.system.units), self.system.units
+        q = self.method.correct(self.system, self.t, self.at(y), rest)[0]
+        crossing = self.method.crossing(self.system, self.t, q)
+        forces, none = generalised_force(move(crossing.configuration, rest)), jnp.zeros(len(crossing.jacobian), q.dtype)
+        left, _ = constrained_solve(crossing.inverse, jnp.diag(units**-2), crossing.jacobian, forces, none)
+        return self.dual @ left
+
+    def at_rest(self):
+        """The force at y = 0, and the stiffness, minus its derivative."""
+        force, slopes = self.slopes(self.force)
+        return force, -slopes
+
+
+class _Moving(_Nearby):
+    """In free motion. The metric is that of the masses, and T stays orthonormal where numbers change."""
+
+    @staticmethod
+    def of(system, method, t, q) -> "_Moving":
         departure = method.departure(system, t, q)
         crossing, mass = departure.crossing, departure.mass
         fixed = crossing.inverse.basis
@@ -83,18 +120,12 @@ class _Tangent(eqx.Module):
         basis = jax.vmap(tangent, in_axes=1, out_axes=1)(fixed)
         empty = jnp.diag((jnp.sum(fixed**2, axis=0) == 0.0).astype(mass.dtype))
         basis = basis @ cholesky_inverse_by_elimination(basis.T @ mass @ basis + empty)[0].T
-        return _Tangent(system, method, t, q, basis, basis.T @ mass)
+        return _Moving(system, method, t, q, basis, basis.T @ mass)
 
     def acceleration(self, y, y_rate):
         """ÿ."""
-        q = retract(self.system.topology, self.q, self.basis @ y)
-        _, acceleration, *_ = self.method.derivative(self.system, self.t, q, self.basis @ y_rate, True)
+        _, acceleration, *_ = self.method.derivative(self.system, self.t, self.at(y), self.basis @ y_rate, True)
         return self.dual @ acceleration
-
-    def stiffness(self):
-        """−∂ÿ/∂y at rest."""
-        rest = jnp.zeros_like(self.system.units)
-        return -jax.jacfwd(self.acceleration)(rest, rest)
 
 
 def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
@@ -135,35 +166,48 @@ def _equilibrium(mechanism, state, t):
     return State(q, jnp.zeros(system.topology.num_speeds, system.dtype)), longest, gap
 
 
+class _Search(NamedTuple):
+    """Where a search for an equilibrium is, the step to try from there, its longest part and the forces' work on it."""
+
+    count: Int[Array, ""]
+    q: Float[Array, " n_q"]
+    step: Float[Array, " n_v"]
+    longest: Float[Array, ""]
+    work: Float[Array, ""]
+
+
 @eqx.filter_custom_jvp
 def _at_rest(system, t, q):
     """Coordinates of an equilibrium, by a search from q; and the longest part of its last step."""
-    method = BALANCED.method(system.dtype)
-    rest = jnp.zeros(system.topology.num_speeds, system.dtype)
+    method, rest = _STATICS.method(system.dtype), jnp.zeros(system.topology.num_speeds, system.dtype)
+    size = lambda step: jnp.max(jnp.abs(step / system.units), initial=0.0)
 
-    def step(q):
-        """Towards the lowest potential nearby: by the stiffness, all of whose directions count as stable."""
-        tangent = _Tangent.at(system, method, t, q)
-        stiffness = tangent.stiffness()
+    def unfinished(search):
+        return (search.count < MOST_STEPS) & (search.longest > AT_REST)
+
+    def advance(search):
+        """Try a step; where it goes beyond the lowest potential, half of it next, or else a new one from there.
+
+        A step is by the stiffness, all of whose directions count as stable.
+        """
+        q, _ = method.close(system, t, retract(system.topology, search.q, search.step), rest)
+        still = _Still.of(system, method, t, q)
+        force, stiffness = still.at_rest()
         values, vectors = jnp.linalg.eigh((stiffness + stiffness.T) / 2.0)
         stiff = jnp.abs(values) > NEUTRAL * jnp.max(jnp.abs(values))
-        along = vectors.T @ tangent.acceleration(rest, rest)
-        downhill = tangent.basis @ (vectors @ jnp.where(stiff, along / jnp.where(stiff, jnp.abs(values), 1.0), along))
-        longest = jnp.max(jnp.abs(downhill / system.units))
-        return downhill * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0)), longest
+        along = vectors.T @ force
+        downhill = vectors @ jnp.where(stiff, along / jnp.where(stiff, jnp.abs(values), 1.0), along)
+        step = still.basis @ downhill
+        shorter = jnp.minimum(1.0, LONGEST_STEP / jnp.where(size(step) > 0.0, size(step), 1.0))
+        onwards = _Search(search.count + 1, q, shorter * step, shorter * size(step), shorter * (downhill @ force))
+        half = _Search(search.count + 1, search.q, search.step / 2.0, search.longest / 2.0, search.work / 2.0)
+        beyond = (still.dual @ search.step) @ force < -OVERSHOOT * search.work
+        return jax.tree.map(lambda a, b: jnp.where(beyond, a, b), half, onwards)
 
-    def unfinished(carry):
-        count, _, longest = carry
-        return (count < MOST_STEPS) & (longest > AT_REST)
-
-    def improve(carry):
-        count, q, _ = carry
-        change, longest = step(q)
-        q, _ = method.close(system, t, retract(system.topology, q, change), rest)
-        return count + 1, q, longest
-
-    start = method.close(system, t, q, rest)[0]
-    return lax.while_loop(unfinished, improve, (jnp.zeros((), int), start, jnp.asarray(jnp.inf, system.dtype)))[1:]
+    nothing = jnp.zeros((), system.dtype)
+    begin = _Search(jnp.zeros((), int), q, rest, nothing + jnp.inf, nothing)
+    found = lax.while_loop(unfinished, advance, begin)
+    return found.q, found.longest
 
 
 @_at_rest.def_jvp
@@ -171,14 +215,14 @@ def _at_rest_jvp(primals, changes):
     """Where the forces stay in balance, to any order: the search has no derivative."""
     (system, t, begin), (system_change, t_change, _) = primals, changes
     q, longest = _at_rest(system, t, begin)
-    tangent = _Tangent.at(system, BALANCED.method(system.dtype), t, q)
+    still = _Still.of(system, _STATICS.method(system.dtype), t, q)
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
-    acceleration = lambda system, t: dataclasses.replace(tangent, system=system, t=t).acceleration(rest, rest)
-    _, unbalanced = eqx.filter_jvp(acceleration, (system, t), (system_change, t_change))
-    change = jnp.linalg.pinv(tangent.stiffness(), rtol=NEUTRAL) @ unbalanced
+    force = lambda system, t: dataclasses.replace(still, system=system, t=t).force(rest)
+    _, unbalanced = eqx.filter_jvp(force, (system, t), (system_change, t_change))
+    change = jnp.linalg.pinv(still.at_rest()[1], rtol=NEUTRAL) @ unbalanced
 
     def moved(system, t, y):
-        return tangent.method.close(system, t, retract(system.topology, q, tangent.basis @ y), rest)[0]
+        return still.method.close(system, t, retract(system.topology, q, still.basis @ y), rest)[0]
 
     _, q_change = eqx.filter_jvp(moved, (system, t, rest), (system_change, t_change, change))
     return (q, longest), (q_change, None)
@@ -232,14 +276,14 @@ def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: 
 def _linearise(mechanism, state, t, count):
     system = _held_system(mechanism, state.q.dtype, t)
     method = BALANCED.method(system.dtype)
-    tangent = _Tangent.differentiable(system, method, t, state.q)
+    moving = _Moving.of(system, method, t, state.q)
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
-    columns = jnp.argsort(jnp.sum(tangent.basis**2, axis=0) == 0.0)[:count]
+    columns = jnp.argsort(jnp.sum(moving.basis**2, axis=0) == 0.0)[:count]
     at_columns = lambda matrix: matrix[columns[:, None], columns[None, :]]
-    stiffness = at_columns(tangent.stiffness())
-    damping = at_columns(-jax.jacfwd(tangent.acceleration, 1)(rest, rest))
+    stiffness = at_columns(-moving.slopes(lambda y: moving.acceleration(y, rest))[1])
+    damping = at_columns(-moving.slopes(lambda y_rate: moving.acceleration(rest, y_rate))[1])
     values, vectors = jnp.linalg.eigh((stiffness + stiffness.T) / 2.0)
-    basis = tangent.basis[:, columns]
+    basis = moving.basis[:, columns]
     return Linearisation(
         natural_frequencies=jnp.sign(values) * jnp.sqrt(jnp.where(values == 0.0, 1.0, jnp.abs(values))),
         modes=basis @ vectors,

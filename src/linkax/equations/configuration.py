@@ -13,13 +13,15 @@ from jaxtyping import Array, Float
 
 from linkax.equations.coordinates import by_speed
 from linkax.equations.system import System
+from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.numbers import value
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, rotate, transpose
+from linkax.spatial.screws import turn_rate
 from linkax.spatial.vectors import cross
-from linkax.tracing import traced_once
+from linkax.tracing import differentiated_whole, traced_once
 
 
 class Configuration(eqx.Module):
@@ -32,9 +34,9 @@ class Configuration(eqx.Module):
     - `parent_arm`, `child_arm`: from the reference point of each joint's parent to the origin
       of the child's frame (tree joints) or of the parent's frame (cut joints), and from the
       child's to that of the child's frame [m], (n_j, 3).
-    - `angular`, `sliding`: motion subspace of each speed: angular velocity, and velocity at the
-      origin of the child's frame, of the moved body per unit speed, (n_v, 3).
-    - `linear`: the same velocity at the anchor of the tree, (n_v, 3).
+    - `angular`, `sliding`: motion subspace of each of the topology's `motions`: angular velocity, and velocity
+      at the origin of the child's frame, of the moved body per unit speed, (n_m, 3).
+    - `linear`: the same velocity at the anchor of the tree, (n_m, 3).
     - `child_axes`: h¹, h², h³ of each cut joint on its child, as columns, (n_cut, 3, 3).
     - `separation`: of each cut joint, from the origin on the parent to that on the child [m],
       (n_cut, 3). It is summed around the loop from the common ancestor, not from the world's origin.
@@ -49,9 +51,9 @@ class Configuration(eqx.Module):
     joint_axes: Float[Array, "n_j 3 3"]
     parent_arm: Float[Array, "n_j 3"]
     child_arm: Float[Array, "n_j 3"]
-    angular: Float[Array, "n_v 3"]
-    sliding: Float[Array, "n_v 3"]
-    linear: Float[Array, "n_v 3"]
+    angular: Float[Array, "n_m 3"]
+    sliding: Float[Array, "n_m 3"]
+    linear: Float[Array, "n_m 3"]
     child_axes: Float[Array, "n_cut 3 3"]
     separation: Float[Array, "n_cut 3"]
 
@@ -156,12 +158,33 @@ def over_subtree(system: System, bodies):
     return total.reshape(bodies.shape)
 
 
-def by_body(system: System, columns):
-    """Sum the contributions (n_v, 3) of speeds for the body that each moves: (n_b, 3)."""
+def by_body(system: System, motions):
+    """Sum what motions (n_m, 3) contribute for the body that each moves: (n_b, 3)."""
     topology = system.topology
-    if np.array_equal(topology.column_body, np.arange(topology.num_bodies)):
-        return columns
-    return jnp.zeros((topology.num_bodies, 3), columns.dtype).at[topology.column_body].add(columns)
+    if np.array_equal(topology.moved_body, np.arange(topology.num_bodies)):
+        return motions
+    return jnp.zeros((topology.num_bodies, 3), motions.dtype).at[topology.moved_body].add(motions)
+
+
+def of_motions(topology, speeds):
+    """What belongs to speeds (n_v, …), for the motions that they cause: (n_m, …)."""
+    return speeds if topology.motion_column is None else speeds[topology.motion_column]
+
+
+def by_speed_of(topology, motions):
+    """Sum what belongs to motions (…, n_m) for the speed that causes each: (…, n_v)."""
+    if topology.motion_column is None:
+        return motions
+    nothing = jnp.zeros((*motions.shape[:-1], topology.num_speeds), motions.dtype)
+    return nothing.at[..., topology.motion_column].add(motions)
+
+
+def beam_point(configuration: Configuration, beam: Beam, point) -> Float[Array, "3"]:
+    """A point (3,) fixed to the section of a beam at point[0], in the world [m]."""
+    base, coordinates = configuration.body(beam.sections[0]), configuration.joint_coordinates(beam.name)
+    section = beam.section_at(coordinates, point[0])
+    seen = section[:3, 3] + section[:3, 1:3] @ point[1:]
+    return configuration.world_position()[base] + configuration.rotation[base] @ seen
 
 
 def bodies_of_cuts(topology):
@@ -176,9 +199,7 @@ def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
     topology, count = system.topology, system.topology.num_bodies
     parent, child = np.array(topology.parent), np.array(topology.child)
     reversed_ = topology.reversed[:, None]
-    turn, angular_subspace = _joint_rotations(topology, q)
-    linear_subspace = _linear_subspace(system)
-    shift = by_body(system, linear_subspace * by_speed(topology, q)[:, None])
+    turn, shift, angular_subspace, linear_subspace = _joint_motions(system, q)
     relative = compose(compose(system.parent_axes[:count], turn), transpose(system.child_axes[:count]))
     if np.any(reversed_):
         relative = jnp.where(reversed_[:, :, None], transpose(relative), relative)
@@ -190,9 +211,9 @@ def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
     sign = jnp.where(reversed_, -1.0, 1.0).astype(q.dtype)
     link = sign * (parent_arm - child_arm)[:count]
     position = along_path(system, link)
-    subspace_axes = (sign[:, :, None] * joint_axes[:count])[topology.column_body]
+    subspace_axes = (sign[:, :, None] * joint_axes[:count])[topology.moved_body]
     angular, sliding = rotate(subspace_axes, angular_subspace), rotate(subspace_axes, linear_subspace)
-    joint_point = (position[child[:count]] + child_arm[:count])[topology.column_body]
+    joint_point = (position[child[:count]] + child_arm[:count])[topology.moved_body]
 
     on_parent, on_child, cuts = bodies_of_cuts(topology)
     anchor = lambda body: system.anchor[np.where(topology.root[body] < 0, cuts, topology.root[body])]
@@ -215,43 +236,66 @@ def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
     )
 
 
-def by_kind(topology):
-    """Joint types in the tree: for each its bodies, and where its coordinates lie in q, (n, n_q of one)."""
-    kinds = topology.joint_types[: topology.num_bodies]
-    for kind in dict.fromkeys(kinds):
-        members = [body for body, other in enumerate(kinds) if other is kind]
-        slices = [topology.coordinates[topology.joints[body]] for body in members]
-        yield kind, members, np.array([np.arange(taken.start, taken.stop) for taken in slices], dtype=int)
+def _joint_motions(system, q):
+    """What the joints of the tree do, in joint axes.
+
+    **Returns:** rotation of each, (n_b, 3, 3), and translation, (n_b, 3); of each motion its subspace, angular
+    and linear, (n_m, 3) each.
+    """
+    topology, order, turns = system.topology, [], []
+    angular = jnp.asarray(_constant_subspace(topology, "angular_subspace"), q.dtype)
+    linear = _linear_subspace(system)
+    shift = by_body(system, linear * of_motions(topology, by_speed(topology, q))[:, None])
+    for kind, numbers in zip(topology.kinds, system.numbers, strict=True):
+        if numbers is not None:
+            turn, away, *subspace = jax.vmap(_bent, (None, 0, 0))(kind.motion, q[kind.places], numbers)
+            motions = _motions_of(topology, kind)
+            angular, linear = (
+                whole.at[motions].set(part.reshape(-1, 3))
+                for whole, part in zip((angular, linear), subspace, strict=True)
+            )
+            shift = shift.at[np.array(kind.bodies)].set(away)
+        else:
+            turn = jax.vmap(kind.motion.rotation)(q[kind.places])
+            if kind.motion.angular_subspace_at is not None:
+                turned = jax.vmap(kind.motion.angular_subspace_at)(q[kind.places])
+                angular = angular.at[_motions_of(topology, kind)].set(turned.reshape(-1, 3))
+        turns.append(turn)
+        order += kind.bodies
+    turn = turns[0] if len(turns) == 1 else jnp.concatenate(turns)[np.argsort(order)]
+    return turn, shift, angular, linear
 
 
-def _joint_rotations(topology, q):
-    """Rotation of each tree joint, (n_b, 3, 3), and angular motion subspace of each speed, (n_v, 3), in joint axes."""
-    order, turns = [], []
-    subspace = jnp.asarray(_constant_subspace(topology, "angular_subspace"), q.dtype)
-    for kind, members, places in by_kind(topology):
-        turns.append(jax.vmap(kind.rotation)(q[places]))
-        if kind.angular_subspace_at is not None:
-            columns = np.flatnonzero(np.isin(topology.column_body, members))
-            subspace = subspace.at[columns].set(jax.vmap(kind.angular_subspace_at)(q[places]).reshape(-1, 3))
-        order += members
-    if len(turns) == 1:
-        return turns[0], subspace
-    return jnp.concatenate(turns)[np.argsort(order)], subspace
+def _motions_of(topology, kind):
+    """Which of the topology's `motions` are those of a kind of joints."""
+    return np.flatnonzero(np.isin(topology.moved_body, kind.bodies))
+
+
+@differentiated_whole
+def _bent(motion, coordinates, numbers):
+    """Rotation and translation of a `Motion`, and its subspace, angular and linear, (n, 3) each."""
+    follow = lambda change: jax.jvp(lambda q: motion(q, numbers), (coordinates,), (change,))
+    at, changes = jax.vmap(follow, out_axes=(None, 0))(jnp.eye(len(coordinates), dtype=coordinates.dtype))
+    return at[:3, :3], at[:3, 3], turn_rate(changes[:, :3, :3], at[:3, :3]), changes[:, :3, 3]
 
 
 def _constant_subspace(topology, part):
-    columns = [column for kind in topology.joint_types[: topology.num_bodies] for column in getattr(kind, part)]
+    """A part of the motion subspace of each motion, (n_m, 3), zero where it is no constant of the joint's type."""
+    columns = []
+    for body, kind in enumerate(topology.joint_types[: topology.num_bodies]):
+        bends = kind.motion is not None
+        columns += len(topology.columns(body)) * [(0.0, 0.0, 0.0)] if bends else getattr(kind, part)
     return np.array(columns).reshape(-1, 3)
 
 
 def _linear_subspace(system):
-    """Linear motion subspace of each speed in joint axes, (n_v, 3)."""
+    """Linear motion subspace of each motion in joint axes, (n_m, 3), zero for joints that bend."""
     topology = system.topology
     subspace = jnp.asarray(_constant_subspace(topology, "linear_subspace"), system.dtype)
-    screws = np.array([kind.is_screw for kind in topology.joint_types[: topology.num_bodies]])[topology.column_body]
+    screws = np.array([kind.is_screw for kind in topology.joint_types[: topology.num_bodies]])[topology.moved_body]
     if not np.any(screws):
         return subspace
-    return jnp.where(screws[:, None], system.number[topology.column_body][:, None], 1.0) * subspace
+    return jnp.where(screws[:, None], system.number[topology.moved_body][:, None], 1.0) * subspace
 
 
 def _along_path_product(topology, relative):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, by_body, over_subtree
+from linkax.equations.configuration import Configuration, by_body, by_speed_of, of_motions, over_subtree
 from linkax.equations.motion import Motion
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
@@ -46,7 +46,7 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
     first = over_subtree(system, own_moment + above(mass[:, None] * configuration.link))
     second = over_subtree(system, own_inertia + above(_shifted(mass, first, configuration.link)))
 
-    body = topology.column_body
+    body = topology.moved_body
     position = configuration.position[body]
     angular, at_anchor = configuration.angular, configuration.linear
     at_body = at_anchor + cross(angular, position)
@@ -54,7 +54,8 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
     moment = rotate(second[body], angular) + cross(first[body], at_body) + cross(position, momentum)
     carried = angular @ moment.T + at_anchor @ momentum.T
     carries = topology.path[:-1][np.ix_(body, body)].T > 0.0
-    return jnp.where(carries, carried, jnp.where(carries.T, carried.T, 0.0))
+    found = jnp.where(carries, carried, jnp.where(carries.T, carried.T, 0.0))
+    return found if topology.motion_column is None else by_speed_of(topology, by_speed_of(topology, found).T)
 
 
 def _onto_carrier(carrier, carried):
@@ -84,10 +85,11 @@ def inertial_wrench(motion: Motion, angular_acceleration, acceleration):
 
 def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " n_v"]:
     """Generalised force of wrenches on bodies, (n_b, 3) each, the moment about the centre of mass."""
-    system, body = configuration.system, configuration.system.topology.column_body
+    system, topology = configuration.system, configuration.system.topology
+    body = topology.moved_body
     arm = configuration.position[:-1] + configuration.center_of_mass()
     force, moment = over_subtree(system, force), over_subtree(system, moment + cross(arm, force))
-    return dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body])
+    return by_speed_of(topology, dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body]))
 
 
 def generalised_force(motion: Motion) -> Float[Array, " n_v"]:
@@ -125,7 +127,8 @@ def body_accelerations(motion: Motion, acceleration: Float[Array, " n_v"]):
     """Angular accelerations and accelerations of reference points at v̇, (n_b, 3) each."""
     configuration, system = motion.configuration, motion.system
     path = jnp.asarray(system.topology.path[:-1], system.dtype)
-    angular = path @ by_body(system, configuration.angular * acceleration[:, None])
-    at_anchor = path @ by_body(system, configuration.linear * acceleration[:, None])
+    acceleration = of_motions(system.topology, acceleration)[:, None]
+    angular = path @ by_body(system, configuration.angular * acceleration)
+    at_anchor = path @ by_body(system, configuration.linear * acceleration)
     linear = at_anchor + cross(angular, configuration.position[:-1])
     return motion.angular_bias[:-1] + angular, motion.bias[:-1] + linear

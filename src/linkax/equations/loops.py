@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, bodies_of_cuts
+from linkax.equations.configuration import Configuration, bodies_of_cuts, by_speed_of
 from linkax.equations.coordinates import by_speed
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
@@ -123,7 +123,7 @@ def immobile_residual(configuration: Configuration) -> Float[Array, " m_immobile
 def _jacobian(configuration: Configuration, rows: Rows):
     topology = configuration.system.topology
     parent, child, joints = bodies_of_cuts(topology)
-    loop = topology.loop[:, topology.column_body]
+    loop = topology.loop[:, topology.moved_body]
     turning = cross(rows.second, rows.first) @ configuration.angular.T
     # The twist of each joint at the point where the loop is cut, reached along its own side.
     on_child = configuration.position[child] + configuration.child_arm[joints]
@@ -136,7 +136,7 @@ def _jacobian(configuration: Configuration, rows: Rows):
     )
     moving = (along @ configuration.linear.T + swept) / rows.length[:, None]
     signs = jnp.asarray(np.concatenate([loop[rows.rotation_cut], loop[at]]), along.dtype)
-    return signs * jnp.concatenate([turning, moving])
+    return by_speed_of(topology, signs * jnp.concatenate([turning, moving]))
 
 
 def _combination(configuration: Configuration):

@@ -1,20 +1,23 @@
 """Twists of all bodies and their velocity-product accelerations, by recursion along the tree."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, along_path, by_body, by_kind
+from linkax.equations.configuration import Configuration, along_path, by_body, of_motions
 from linkax.equations.system import System
 from linkax.model.bodies import Frame
 from linkax.model.forces import Load
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import rotate
+from linkax.spatial.screws import turn_rate
 from linkax.spatial.vectors import cross
-from linkax.tracing import traced_once
+from linkax.tracing import differentiated_whole, traced_once
 
 
 class Motion(eqx.Module):
@@ -85,10 +88,9 @@ class Motion(eqx.Module):
         body = self.configuration.body(frame.body)
         return self.velocity[body] + cross(self.angular_velocity[body], self.configuration.arm(frame))
 
-    def point_load(self, frame: Frame, force) -> Load:
-        """A force at the origin of a frame, in ground axes [N]; one on the ground does nothing."""
-        nothing = jnp.zeros(3, self.system.dtype)
-        return self._wrench(self.configuration.body(frame.body), self.configuration.arm(frame), force, nothing)
+    def point_load(self, frame: Frame, force, moment=0.0) -> Load:
+        """A force at the origin of a frame, and a moment, in ground axes [N, N m]; on the ground they do nothing."""
+        return self._wrench(self.configuration.body(frame.body), self.configuration.arm(frame), force, moment)
 
     def _wrench(self, body, arm, force, moment) -> Load:
         """A force at a point of a body, and a moment."""
@@ -112,12 +114,14 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
     sign = jnp.where(topology.reversed[:, None], -1.0, 1.0).astype(v.dtype)
     parent_arm, child_arm = configuration.parent_arm[:count], configuration.child_arm[:count]
 
-    edge_turn = by_body(system, configuration.angular * v[:, None])
-    edge_slide = by_body(system, configuration.sliding * v[:, None])
+    speed = of_motions(topology, v)[:, None]
+    edge_turn = by_body(system, configuration.angular * speed)
+    edge_slide = by_body(system, configuration.sliding * speed)
     omega = along_path(system, edge_turn)
     edge_angular_bias = cross(omega[parent], edge_turn)
-    if any(kind.angular_subspace_at is not None for kind in topology.joint_types[:count]):
-        edge_angular_bias = edge_angular_bias + _subspace_bias(configuration, v)
+    turned, slid = _subspace_bias(configuration, v)
+    if turned is not None:
+        edge_angular_bias = edge_angular_bias + sign * turned
     alpha = along_path(system, edge_angular_bias)
 
     parent_rate, child_rate = cross(omega[parent], parent_arm), cross(omega[child], child_arm)
@@ -125,6 +129,8 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
     parent_bias = cross(alpha[parent], parent_arm) + cross(omega[parent], parent_rate)
     child_bias = cross(alpha[child], child_arm) + cross(omega[child], child_rate)
     edge_bias = sign * (parent_bias - child_bias) + 2.0 * cross(omega[parent], edge_slide)
+    if slid is not None:
+        edge_bias = edge_bias + sign * slid
     return Motion(
         configuration=configuration,
         v=v,
@@ -140,20 +146,45 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
 
 
 def _subspace_bias(configuration, v):
-    """Angular accelerations by motion subspaces that turn with their own coordinates, (n_b, 3)."""
-    topology = configuration.system.topology
-    sign = jnp.where(topology.reversed, -1.0, 1.0).astype(v.dtype)
-    total = jnp.zeros((topology.num_bodies, 3), v.dtype)
-    for kind, members, places in by_kind(topology):
-        if kind.angular_subspace_at is None:
+    """Accelerations of each joint's child by motion subspaces that change with coordinates, (n_b, 3) each.
+
+    **Returns:** angular and linear ones, seen from the parent, in ground axes; None where there are none.
+    """
+    system, topology = configuration.system, configuration.system.topology
+    angular, linear = {}, {}
+    for kind, numbers in zip(topology.kinds, system.numbers, strict=True):
+        members = np.array(kind.bodies)
+        coordinates = configuration.q[kind.places]
+        speeds = v[np.stack([topology.columns(body) for body in kind.bodies])]
+        if numbers is not None:
+            bent = jax.vmap(_bending, (None, 0, 0, 0))(kind.motion, coordinates, speeds, numbers)
+        elif kind.motion.angular_subspace_at is not None:
+            bent = (jax.vmap(partial(_turning, kind.motion))(coordinates, speeds),)
+        else:
             continue
-        speeds = v[np.array([np.flatnonzero(topology.column_body == body) for body in members])]
+        for found, part in zip((angular, linear), bent, strict=False):
+            found[kind.bodies] = rotate(configuration.joint_axes[members], part)
+    return _scattered(topology, angular), _scattered(topology, linear)
 
-        def bias(q, rates, kind=kind):
-            turning = jax.jvp(kind.angular_subspace_at, (q,), (rates,))[1]
-            return rates @ turning
 
-        turned = jax.vmap(bias)(configuration.q[places], speeds)
-        axes = configuration.joint_axes[np.array(members)]
-        total = total.at[np.array(members)].set(sign[np.array(members)][:, None] * rotate(axes, turned))
-    return total
+def _scattered(topology, parts):
+    """Values (n, 3) of bodies, (n_b, 3) of all; None for none."""
+    if not parts:
+        return None
+    members, values = np.concatenate([np.array(bodies) for bodies in parts]), jnp.concatenate([*parts.values()])
+    return jnp.zeros((topology.num_bodies, 3), values.dtype).at[members].set(values)
+
+
+def _turning(kind, coordinates, speeds):
+    """Angular acceleration by axes that turn with their own coordinates."""
+    return speeds @ jax.jvp(kind.angular_subspace_at, (coordinates,), (speeds,))[1]
+
+
+@differentiated_whole
+def _bending(motion, coordinates, speeds, numbers):
+    """Angular and linear acceleration of a `Motion` at constant speeds."""
+    place = lambda coordinates: motion(coordinates, numbers)
+    rate = lambda coordinates: jax.jvp(place, (coordinates,), (speeds,))[1]
+    at, accelerations = place(coordinates), jax.jvp(rate, (coordinates,), (speeds,))[1]
+    # The symmetric part of R̈ Rᵀ is ω × (ω × …).
+    return turn_rate(accelerations[:3, :3], at[:3, :3]), accelerations[:3, 3]

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, bodies_of_cuts, by_body, over_subtree
+from linkax.equations.configuration import Configuration, bodies_of_cuts, by_body, of_motions, over_subtree
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
 from linkax.equations.loops import Rows, combined_rows, immobile_rows, plain_rows, sorted_multipliers
 from linkax.equations.motion import Motion
@@ -113,10 +113,12 @@ def _carried(configuration: Configuration, needed: Load, cut: Reaction, multipli
     joint_child = np.array(topology.child)[:count]
     point = configuration.position[joint_child] + configuration.child_arm[:count]
     moment = moment - cross(point, force)
-    along = joint_force[:, None]
-    # On a screw it is a torque.
-    slides = np.array([not kind.is_screw for kind in topology.joint_types[:count]])[topology.column_body]
+    # On a screw it is a torque; of a joint that bends, the reaction is all that its section carries.
+    kinds = topology.joint_types[:count]
+    turns = np.array([kind.motion is None for kind in kinds])[topology.moved_body]
+    slides = np.array([kind.motion is None and not kind.is_screw for kind in kinds])[topology.moved_body]
+    along = of_motions(topology, joint_force)[:, None]
     force = force - by_body(system, slides[:, None] * along * configuration.sliding)
-    moment = moment - by_body(system, along * configuration.angular)
+    moment = moment - by_body(system, turns[:, None] * along * configuration.angular)
     sign = jnp.where(topology.reversed[:, None], -1.0, 1.0).astype(system.dtype)
     return Reaction(jnp.concatenate([sign * force, cut.force]), jnp.concatenate([sign * moment, cut.moment]))

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
+from linkax.model.joints.joint import Motion
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import length as length_of
@@ -23,6 +24,7 @@ class System(eqx.Module):
       a mechanism far from the origin loses no digits.
     - `parent_axes`, `child_axes` (n_j, 3, 3): the joint's axes as columns, in body axes.
     - `number` [m] (n_j,): the number of a joint whose type has one.
+    - `numbers`: of each of the topology's `kinds` with a `Motion` those of its joints, (n, k); None for the others.
     - `loop_length` [m] (n_cut,): half the way around each loop, the unit of its translation rows.
     - `length` [m]: the mechanism's length, the unit of sliding coordinates.
     - `coupling` (k, n_v): coefficients of the constraints on coordinates of the tree, and
@@ -39,6 +41,7 @@ class System(eqx.Module):
     parent_axes: Float[Array, "n_j 3 3"]
     child_axes: Float[Array, "n_j 3 3"]
     number: Float[Array, " n_j"]
+    numbers: tuple[Float[Array, "n k"] | None, ...]
     loop_length: Float[Array, " n_cut"]
     length: Float[Array, ""]
     coupling: Float[Array, "k n_v"]
@@ -75,7 +78,9 @@ def system_of(mechanism: Mechanism, dtype, fixed_units: bool = True) -> System:
     child_on_ground = (np.array(topology.child) == GROUND_INDEX)[:, None]
     center_of_mass = stack([body.center_of_mass for body in mechanism.bodies], (3,))
     fixed = lax.stop_gradient if fixed_units else lambda array: array
-    loop_length, length = _lengths(topology, *map(fixed, (parent_offset, child_offset, center_of_mass)))
+    bends = np.array([joint.kind.motion is not None for joint in joints], dtype=bool)
+    reach = stack([joint.reach for joint in joints], ()) if np.any(bends) else None
+    loop_length, length = _lengths(topology, *map(fixed, (parent_offset, child_offset, center_of_mass)), reach)
     coupling = _coupling(mechanism, dtype)
     slides = jnp.where(topology.slides, length, jnp.ones((), dtype))
     return System(
@@ -88,6 +93,10 @@ def system_of(mechanism: Mechanism, dtype, fixed_units: bool = True) -> System:
         anchor=jnp.where(parent_on_ground, parent_offset, jnp.where(child_on_ground, child_offset, 0.0)),
         parent_axes=stack([parent for parent, _ in frames], (3, 3)),
         child_axes=stack([child for _, child in frames], (3, 3)),
+        numbers=tuple(
+            stack([joints[body].numbers for body in kind.bodies], ()) if isinstance(kind.motion, Motion) else None
+            for kind in topology.kinds
+        ),
         number=stack([0.0 if joint.number is None else joint.number for joint in joints], ()),
         loop_length=loop_length,
         length=length,
@@ -108,12 +117,15 @@ def _coupling(mechanism, dtype):
     return coupling
 
 
-def _lengths(topology, parent_offset, child_offset, center_of_mass):
-    """Half the way around each loop, and the larger of these and of the reach from ground [m]."""
+def _lengths(topology, parent_offset, child_offset, center_of_mass, bent):
+    """Half the way around each loop, and the larger of these and of the reach from ground [m].
+
+    `bent`: what joints that bend add to a way, (n_j,); None where there are none.
+    """
     ends = jnp.concatenate([parent_offset, child_offset])  # joint j: rows j and n_j + j
     distance = lambda pairs: length_of(ends[pairs[:, 0]] - ends[pairs[:, 1]])
-    around = [np.array(_stations(topology, cut)).reshape(-1, 2) for cut in range(topology.num_cuts)]
-    loop_length = jnp.stack([jnp.sum(distance(pairs)) / 2 for pairs in around]) if around else jnp.zeros(0, ends.dtype)
+    ways = [np.array(_stations(topology, cut)).reshape(-1, 2) for cut in range(topology.num_cuts)]
+    around = [jnp.sum(distance(pairs)) for pairs in ways]
 
     count = len(topology.joints)
     moved = np.arange(topology.num_bodies)
@@ -121,6 +133,10 @@ def _lengths(topology, parent_offset, child_offset, center_of_mass):
     far = np.where(topology.reversed, moved, moved + count)  # the end on the body itself
     carrier = np.array(topology.predecessor)
     link = jnp.where(carrier == GROUND_INDEX, 0.0, distance(np.stack([near, far[carrier]], axis=-1)))
+    if bent is not None:
+        link = link + bent[moved]
+        around = [way + np.abs(loop) @ bent[moved] for way, loop in zip(around, topology.loop, strict=True)]
+    loop_length = jnp.stack([way / 2 for way in around]) if around else jnp.zeros(0, ends.dtype)
     to_mass = length_of(center_of_mass - ends[far])
     reach = jnp.asarray(topology.path[:-1], ends.dtype) @ link + to_mass
     length = jnp.max(jnp.concatenate([loop_length, reach]))

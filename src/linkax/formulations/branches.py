@@ -67,8 +67,10 @@ class Crossing(eqx.Module):
     def _driven(self, scale):
         return drive_acceleration(self.configuration.system, self.configuration.t) / scale**2
 
-    def along(self, v) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
+    def along(self, v, from_rest) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
         """Along speeds v, of any size: how far they are from a branch, and the ranks of all islands next to here.
+
+        Where v are accelerations `from_rest`, what drives ask for is relative to them, and not to their square.
 
         The first is `off_branch` of speeds of which the largest is one; the second, by first-order
         perturbation, rank(J) + rank(Uᵀ J̇ N) with U, N the null spaces of Jᵀ and J.
@@ -88,4 +90,5 @@ class Crossing(eqx.Module):
             return jnp.sum(jnp.abs(jnp.diagonal(pivoted_qr(block).r)) > OPENING)
 
         opened = jnp.stack([opening(*island) for island in self.configuration.system.topology.islands])
-        return outside[:, 0] + self._outside(self._driven(scale)), self.inverse.rank + opened
+        driven = self._driven(jnp.where(from_rest, jnp.sqrt(scale), scale))
+        return outside[:, 0] + self._outside(driven), self.inverse.rank + opened

@@ -76,4 +76,5 @@ def unbalanced(state: Moved, acceleration, multipliers):
         return unbalanced_force(motion, acceleration) + rows.T @ multipliers, gamma(motion) - rows @ acceleration
 
     at = state.configuration, state.jacobian, state.v
-    return eqx.filter_jvp(sides, at, (state.to_configuration, state.to_jacobian, state.to_v))[1]
+    found, changes = eqx.filter_jvp(sides, at, (state.to_configuration, state.to_jacobian, state.to_v))
+    return tuple(jnp.zeros_like(of) if change is None else change for of, change in zip(found, changes, strict=True))

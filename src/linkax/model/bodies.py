@@ -1,5 +1,7 @@
 """Rigid bodies and the frames on them."""
 
+import abc
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -23,12 +25,25 @@ class Frame(eqx.Module):
     rotation: Constant | Float[Array, "3 3"]
 
 
-class Ground(eqx.Module):
+class AbstractBody(eqx.Module):
+    """What joints and forces attach to."""
+
+    @property
+    @abc.abstractmethod
+    def reference(self) -> Frame:
+        """Its reference frame, which it stands for itself."""
+
+
+class Ground(AbstractBody):
     """The fixed world, body `lx.GROUND`: joints start from it, nothing moves it."""
 
     @property
     def name(self) -> str:
         return GROUND_NAME
+
+    @property
+    def reference(self):
+        return self.at([0.0, 0.0, 0.0])
 
     def at(self, offset, rotation=None) -> Frame:
         """A frame fixed to the ground: origin `offset` [m] and axes `rotation` in world axes."""
@@ -42,7 +57,7 @@ class Ground(eqx.Module):
 GROUND = Ground()
 
 
-class RigidBody(eqx.Module):
+class RigidBody(AbstractBody):
     """A rigid body, described in its own reference frame.
 
     **Arguments:**
@@ -65,11 +80,7 @@ class RigidBody(eqx.Module):
     frames: dict[str, Float[Array, "3"]]
 
     def __init__(self, name, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(0.0, 0.0, 0.0), frames=None):
-        if not isinstance(name, str) or not name:
-            raise ValueError(f"body name is {name!r}; give a non-empty string")
-        if name == GROUND_NAME:
-            raise ValueError(f"body {name!r}: this name belongs to lx.GROUND; choose another")
-        self.name = name
+        self.name = body_name(name)
         self.mass = require(
             number(mass, (), f"body {name!r}: mass [kg]"),
             lambda kilograms: kilograms >= 0.0,
@@ -82,6 +93,10 @@ class RigidBody(eqx.Module):
             label: number(offset, (3,), f"body {name!r}: frame {label!r} [m]")
             for label, offset in (frames or {}).items()
         }
+
+    @property
+    def reference(self):
+        return self.at([0.0, 0.0, 0.0])
 
     def at(self, where, rotation=None) -> Frame:
         """A frame on this body: at a named frame or at an offset [m], with axes `rotation`.
@@ -103,12 +118,19 @@ class RigidBody(eqx.Module):
         return Frame(self.name, offset, rotation_matrix(rotation, f"rotation of a frame on body {self.name!r}"))
 
 
+def body_name(name) -> str:
+    """The name of a body, checked."""
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"body name is {name!r}; give a non-empty string")
+    if name == GROUND_NAME:
+        raise ValueError(f"body {name!r}: this name belongs to lx.GROUND; choose another")
+    return name
+
+
 def frame_of(place, what) -> Frame:
     """The frame that a user means by a body, `body.at(...)`, or the ground; `what` names it in errors."""
-    if isinstance(place, Ground):
-        return GROUND.at([0.0, 0.0, 0.0])
-    if isinstance(place, RigidBody):
-        return place.at([0.0, 0.0, 0.0])
+    if isinstance(place, AbstractBody):
+        return place.reference
     if isinstance(place, Frame):
         return place
     raise ValueError(f"{what} is {place!r}; give a body, body.at(...), or lx.GROUND")

@@ -280,7 +280,28 @@ class Damper(_BetweenPoints):
         return self.damping * rate * direction
 
 
-class PointForce(AbstractForce):
+class _OnPoint(AbstractForce):
+    """A vector on a point of a body, in ground axes or in those of the frame there."""
+
+    point: Frame
+    axes: Literal["ground", "frame"] = eqx.field(static=True)
+
+    def __init__(self, point, axes):
+        self.point = frame_of(point, f"{type(self).__name__}: point")
+        if axes not in ("ground", "frame"):
+            raise ValueError(f"{self.described}: axes is {axes!r}; known: 'ground', 'frame'")
+        self.axes = axes
+
+    @property
+    def frames(self):
+        return (self.point,)
+
+    def _in_ground_axes(self, entry, t, motion):
+        vector = evaluated(entry, t, motion)
+        return motion.configuration.axes(self.point) @ vector if self.axes == "frame" else vector
+
+
+class PointForce(_OnPoint):
     """A force on a point of a body.
 
     **Arguments:**
@@ -290,26 +311,31 @@ class PointForce(AbstractForce):
     - `axes`: "ground" (default), or "frame": those of the frame at the point, which turn with it.
     """
 
-    point: Frame
     force: Float[Array, "3"] | Law
-    axes: Literal["ground", "frame"] = eqx.field(static=True)
 
     def __init__(self, point, force, axes="ground"):
-        self.point = frame_of(point, "PointForce: point")
+        super().__init__(point, axes)
         self.force = number_or_law(force, (3,), f"{self.described}: force [N]")
-        if axes not in ("ground", "frame"):
-            raise ValueError(f"{self.described}: axes is {axes!r}; known: 'ground', 'frame'")
-        self.axes = axes
-
-    @property
-    def frames(self):
-        return (self.point,)
 
     def load(self, t, motion):
-        force = evaluated(self.force, t, motion)
-        if self.axes == "frame":
-            force = motion.configuration.axes(self.point) @ force
-        return motion.point_load(self.point, force)
+        return motion.point_load(self.point, self._in_ground_axes(self.force, t, motion))
+
+
+class PointMoment(_OnPoint):
+    """A moment on a body; on a beam, on its section at the point.
+
+    **Arguments:** like those of `PointForce`, with `moment`: three numbers [N m], or a function.
+    """
+
+    moment: Float[Array, "3"] | Law
+
+    def __init__(self, point, moment, axes="ground"):
+        super().__init__(point, axes)
+        self.moment = number_or_law(moment, (3,), f"{self.described}: moment [N m]")
+
+    def load(self, t, motion):
+        nothing = jnp.zeros(3, motion.system.dtype)
+        return motion.point_load(self.point, nothing, self._in_ground_axes(self.moment, t, motion))
 
 
 def _frames(kind, first, second):

@@ -4,10 +4,12 @@ from collections import Counter
 
 import equinox as eqx
 
+from linkax.model.beams import Beam, held_first, taken_apart
 from linkax.model.bodies import GROUND_NAME, RigidBody
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
 from linkax.model.immobile_rows import split_rows
+from linkax.model.joints.bending import Sliding
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
@@ -15,6 +17,9 @@ from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
 
 class Mechanism(eqx.Module):
     """Bodies held together by joints, with the constraints and the forces on them.
+
+    Beams are taken apart into sections, bodies with names such as "boom[2.5]" (in elements from the base), and
+    places on them that something attaches to into massless bodies. `beams` holds them as they were given.
 
     The spanning tree and the cut joints are found here, in any order of the joints: breadth
     first from ground, joints that carry a constraint or a force element first.
@@ -33,6 +38,7 @@ class Mechanism(eqx.Module):
     """
 
     bodies: tuple[RigidBody, ...]
+    beams: tuple[Beam, ...]
     joints: tuple[AbstractJoint, ...]
     forces: tuple[AbstractForce, ...]
     constraints: tuple[AbstractConstraint, ...]
@@ -44,14 +50,27 @@ class Mechanism(eqx.Module):
         )
         joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
         constraints = [c for c in constraints if not isinstance(c, Distance)]
-        bodies, joints = _checked(bodies, RigidBody, "bodies"), _checked(joints, AbstractJoint, "joints", "Joint")
-        forces = _checked(forces, AbstractForce, "forces", "Force")
+        bodies = _checked(bodies, (RigidBody, Beam), "bodies", "RigidBody or Beam")
+        joints, forces = (
+            _checked(joints, AbstractJoint, "joints", "Joint"),
+            _checked(forces, AbstractForce, "forces", "Force"),
+        )
+        beams = [body for body in bodies if isinstance(body, Beam)]
+        bodies, joints, forces = taken_apart(bodies, joints, forces)
         by_name, joint_by_name = _by_name(bodies, "body"), _by_name(joints, "joint")
         _by_name([*joints, *constraints], "joint or constraint")
         _check_references(by_name, joint_by_name, constraints, forces)
         related = {name for constraint in constraints for name in constraint.joints}
         acted_on = {name for force in forces for name in force.joints}
-        order, carriers, predecessors, cuts = spanning_tree(list(by_name), joints, [related, acted_on])
+        order, carriers, predecessors, cuts = spanning_tree(
+            list(by_name), joints, [*held_first(joints), related, acted_on]
+        )
+        for joint in cuts:
+            if isinstance(joint, Sliding):
+                raise ValueError(
+                    f"joint {joint.name!r} slides along a beam and closes a loop; put a massless body on it, and close "
+                    "the loop by another joint on that body"
+                )
         for name in related & {joint.name for joint in cuts}:
             of_joint = ", ".join(repr(c.name) for c in constraints if name in c.joints)
             raise ValueError(
@@ -59,6 +78,7 @@ class Mechanism(eqx.Module):
                 "turns; remove cut=True, or relate fewer joints of this loop"
             )
         self.bodies = tuple(by_name[name] for name in order)
+        self.beams = tuple(beams)
         self.joints = (*carriers, *cuts)
         self.forces = tuple(forces)
         self.constraints = tuple(constraints)
@@ -69,7 +89,8 @@ class Mechanism(eqx.Module):
             predecessor=tuple(index[name] for name in predecessors),
             parent=tuple(index[joint.parent.body] for joint in self.joints),
             child=tuple(index[joint.child.body] for joint in self.joints),
-            joint_types=tuple(type(joint) for joint in self.joints),
+            joint_types=tuple(joint.kind for joint in self.joints),
+            movers=tuple(joint.movers for joint in self.joints),
             **split_rows(carriers, predecessors, cuts, all_rows),
             constraints=tuple(constraint.name for constraint in constraints),
             constraint_terms=tuple(constraint.terms for constraint in constraints),
@@ -79,9 +100,10 @@ class Mechanism(eqx.Module):
         """The same mechanism with those loop rows too that no motion changes (see `all_rows`)."""
         return Mechanism(self.bodies, self.joints, self.forces, self.constraints, all_rows=True)
 
-    def body(self, name: str) -> RigidBody:
-        """The body of that name."""
-        return self.bodies[_find(name, self.topology.bodies, "body")]
+    def body(self, name: str) -> RigidBody | Beam:
+        """The body of that name, a beam or one of its sections too."""
+        names = (*self.topology.bodies, *(beam.name for beam in self.beams))
+        return (*self.bodies, *self.beams)[_find(name, names, "body")]
 
     def joint(self, name: str) -> AbstractJoint:
         """The joint of that name."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
-from linkax.model.joints.joint import AbstractJoint
+from linkax.model.joints.joint import AbstractJoint, JointKind, Motion
 from linkax.model.terms import Term
 
 GROUND_INDEX = -1
@@ -21,6 +21,18 @@ class Island(NamedTuple):
     columns: tuple[int, ...]
 
 
+class Kind(NamedTuple):
+    """Joints in the tree that move in the same way.
+
+    - `motion`: the type of the joints, or their `motion` where it has one.
+    - `bodies`: those that they carry. `places`: where in q the coordinates lie that move each, (n, k).
+    """
+
+    motion: type[AbstractJoint] | Motion
+    bodies: tuple[int, ...]
+    places: np.ndarray
+
+
 @dataclasses.dataclass(frozen=True)
 class Topology:
     """The static plan of a mechanism; equal plans share their compiled programs.
@@ -30,7 +42,9 @@ class Topology:
 
     - `predecessor`: the body that carries each body in the tree.
     - `parent`, `child`: bodies of each joint as it was declared.
-    - `joint_types`: class of each joint.
+    - `joint_types`: class of each joint, or what else says the same of it (see `AbstractJoint.kind`).
+    - `movers`: for each joint whose motion depends on other coordinates than its own, what they are
+      coordinates of, its own among them; None for the rest.
     - `rotation_rows`: (cut joint, i, j) of each loop row h₁ⁱ·h₂ʲ, `translation_rows`:
       (cut joint, i) of each loop row h₁ⁱ·s; cut joints and axes counted from 0. Rows that
       vanish identically are left out here, and kept in `immobile_rotation_rows` and
@@ -47,7 +61,8 @@ class Topology:
     predecessor: tuple[int, ...]
     parent: tuple[int, ...]
     child: tuple[int, ...]
-    joint_types: tuple[type[AbstractJoint], ...]
+    joint_types: tuple[type[AbstractJoint] | JointKind, ...]
+    movers: tuple[tuple[Term, ...] | None, ...]
     rotation_rows: tuple[tuple[int, int, int], ...]
     translation_rows: tuple[tuple[int, int], ...]
     immobile_rotation_rows: tuple[tuple[int, int, int], ...]
@@ -108,16 +123,34 @@ class Topology:
         place = taken.start + term.index + self.joint_types[self.joints.index(term.joint)].has_quaternion
         return slice(place, place + 1)
 
+    def columns(self, body: int) -> np.ndarray:
+        """Where in v the speeds lie that move a body on its predecessor."""
+        movers, taken = self.movers[body], self.speeds[self.joints[body]]
+        if movers is None:
+            return np.arange(taken.start, taken.stop)
+        return np.array([self.column(term) for term in movers], dtype=int)
+
     @cached_property
-    def column_body(self) -> np.ndarray:
-        """The body that each speed moves directly, shape (n_v,)."""
-        counts = [len(kind.speed_units) for kind in self.joint_types[: self.num_bodies]]
-        return np.repeat(np.arange(self.num_bodies), counts)
+    def motions(self) -> np.ndarray:
+        """All pairs of a body and a speed that moves it on its predecessor, (n_m, 2), in the order of bodies."""
+        pairs = [(body, column) for body in range(self.num_bodies) for column in self.columns(body)]
+        return np.array(pairs, dtype=int).reshape(-1, 2)
 
     @property
+    def moved_body(self) -> np.ndarray:
+        """The bodies of `motions`, (n_m,)."""
+        return self.motions[:, 0]
+
+    @cached_property
+    def motion_column(self) -> np.ndarray | None:
+        """The speeds of `motions`, (n_m,); None where each speed moves one body, so that they are in order."""
+        columns = self.motions[:, 1]
+        return None if np.array_equal(columns, np.arange(self.num_speeds)) else columns
+
+    @cached_property
     def num_speeds(self) -> int:
         """n_v."""
-        return len(self.column_body)
+        return sum(len(kind.speed_units) for kind in self.joint_types[: self.num_bodies])
 
     @property
     def num_coordinates(self) -> int:
@@ -142,6 +175,21 @@ class Topology:
         return np.stack([np.setdiff1d(q, in_q), np.setdiff1d(v, in_v)], axis=-1)
 
     @cached_property
+    def kinds(self) -> tuple["Kind", ...]:
+        """The joints in the tree by what their motion is."""
+        of_motion = {}
+        for body, kind in enumerate(self.joint_types[: self.num_bodies]):
+            of_motion.setdefault(kind if kind.motion is None else kind.motion, []).append(body)
+        return tuple(Kind(motion, tuple(bodies), self._read_by(bodies)) for motion, bodies in of_motion.items())
+
+    def _read_by(self, bodies):
+        if self.movers[bodies[0]] is None:
+            taken = [self.coordinates[self.joints[body]] for body in bodies]
+            return np.array([np.arange(places.start, places.stop) for places in taken], dtype=int)
+        places = [[self.places(term).start for term in self.movers[body]] for body in bodies]
+        return np.array(places, dtype=int)
+
+    @cached_property
     def slides(self) -> np.ndarray:
         """Which speeds are of lengths [m/s], shape (n_v,)."""
         kinds = self.joint_types[: self.num_bodies]
@@ -150,11 +198,12 @@ class Topology:
     @cached_property
     def islands(self) -> tuple["Island", ...]:
         """Parts of the mechanism that neither a loop nor an inertia connects, in the order of their speeds."""
-        of_joints = [np.flatnonzero(moved) for moved in self.loop[:, self.column_body]]
+        moving = lambda bodies: np.unique(self.motions[bodies[self.moved_body] != 0.0, 1])
+        of_joints = [moving(around) for around in self.loop]
         of_constraints = [np.array([self.column(term) for term in terms]) for terms in self.constraint_terms]
         plain = [cut for cut, *_ in (*self.rotation_rows, *self.translation_rows)]
         of_rows = [of_joints[cut] for cut in (*plain, *self.combining)] + of_constraints
-        carried = [np.flatnonzero(on_path[self.column_body]) for on_path in self.path[:-1]]
+        carried = [moving(on_path) for on_path in self.path[:-1]]
 
         label = np.arange(self.num_speeds)
         for together in (*carried, *of_rows):

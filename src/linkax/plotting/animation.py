@@ -16,6 +16,7 @@ from PIL import Image
 
 from linkax.equations.coordinates import rates
 from linkax.model.bodies import GROUND_NAME
+from linkax.model.joints.bending import OnBeam
 from linkax.model.mechanism import Mechanism
 from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
 from linkax.simulation.solution import Solution
@@ -51,6 +52,7 @@ def animate_mechanism(solution: Solution, path, points=None, dpi: int = 100) -> 
     _draw_ground(axes, scenery)
     actors = [
         *_draw_slides(axes, scenery),
+        *_draw_beams(axes, scenery),
         *_draw_bodies(axes, scenery),
         *_draw_hinges(axes, scenery),
         *_draw_traces(axes, scenery),
@@ -185,11 +187,11 @@ def _canvas(scenery, dpi):
 
 
 def _is_slide(joint):
-    return joint.speed_units.count("m") == 1
+    return joint.speed_units.count("m") == 1 and not isinstance(joint, OnBeam)
 
 
 def _is_hinge(joint):
-    return "rad" in joint.speed_units and not _is_slide(joint)
+    return "rad" in joint.speed_units and not _is_slide(joint) and not isinstance(joint, OnBeam)
 
 
 def _draw_clock(axes, times):
@@ -269,7 +271,10 @@ def _draw_traces(axes, scenery):
 def _draw_bodies(axes, scenery):
     """Each body as the hull of its marked points with a thick round edge, a concentrated mass as a disc."""
     actors = []
+    sections = {section for beam in scenery.mechanism.beams for section in beam.sections}
     for body in scenery.mechanism.bodies:
+        if body.name in sections:
+            continue
         colour, outline = _colour(scenery.mechanism, body.name), scenery.outlines[body.name]
         if len(outline) > 1:
             corners = np.stack([scenery.seen(body.name, mark) for mark in outline], axis=1)
@@ -277,6 +282,17 @@ def _draw_bodies(axes, scenery):
             actors.append(_draw_polygon(axes, list(map(_hull, corners)), style))
         if _is_concentrated(scenery.mechanism, body):
             actors.append(_draw_disc(axes, scenery.seen(body.name, body.center_of_mass), 15, colour, INK))
+    return actors
+
+
+def _draw_beams(axes, scenery):
+    """Each beam as a thick line through its sections."""
+    actors = []
+    for beam in scenery.mechanism.beams:
+        way = np.stack([scenery.seen(section, np.zeros(3)) for section in beam.sections], axis=1)
+        colour = _colour(scenery.mechanism, beam.sections[0])
+        (line,) = axes.plot(*way[0].T, color=colour, linewidth=6.0, solid_capstyle="round", solid_joinstyle="round")
+        actors.append(_Actor(line, lambda index, line=line, way=way: line.set_data(*way[index].T)))
     return actors
 
 

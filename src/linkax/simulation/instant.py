@@ -4,9 +4,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import configure
+from linkax.equations.configuration import beam_point, configure
+from linkax.equations.coordinates import rates
 from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
 from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
 from linkax.equations.motion import move
@@ -69,6 +71,23 @@ class Instant(NamedTuple):
         arm, omega = _arm(motion.configuration, body, point), motion.angular_velocity[body]
         angular, linear = body_accelerations(motion, self.dynamics.acceleration)
         return linear[body] + cross(angular[body], arm) + cross(omega, cross(omega, arm))
+
+    def center_of_mass(self, function, bodies):
+        """What `position`, `velocity` or `acceleration` say of the centre of mass of several bodies."""
+        of_bodies = function(self, np.array(bodies), jnp.zeros(3, self.q.dtype))
+        mass = self.system.mass[np.array(bodies)]
+        return mass @ of_bodies / jnp.sum(mass)
+
+    def on_beam(self, function, beam, point):
+        """The same of a point fixed to the section of a beam at point[0]."""
+        place = lambda t, q: beam_point(configure(self.system, t, q), beam, point)
+        if function is Instant.position:
+            return place(self.t, self.q)
+        moving = lambda t, q, v: jax.jvp(place, (t, q), (jnp.ones_like(t), rates(self.system.topology, q, v)))[1]
+        if function is Instant.velocity:
+            return moving(self.t, self.q, self.v)
+        changes = jnp.ones_like(self.t), rates(self.system.topology, self.q, self.v), self.dynamics.acceleration
+        return jax.jvp(moving, (self.t, self.q, self.v), changes)[1]
 
     def orientation(self, body):
         return self.configuration.rotation[body]

@@ -6,6 +6,7 @@ configuration; `MechanismControl` measures errors in the units of the mechanism,
 rounding alone causes, and places steps so that no stage falls close to a singular configuration.
 """
 
+import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -118,6 +119,22 @@ def placements(nodes) -> np.ndarray:
     return np.array([placement(node) if node > 0.0 else 1.0 for node in nodes])
 
 
+class StageNorm(eqx.Module):
+    """The size of a change of the rates at a stage: what it changes of the state, relative to the tolerances."""
+
+    problem: Problem
+    y0: Float[Array, " n"]
+    duration: Float[Array, ""]
+    tolerances: tuple[Array, Array]
+
+    def __call__(self, change):
+        problem, (rtol, atol) = self.problem, self.tolerances
+        units, (of_q, of_v) = problem.system.units, problem.errors(self.y0, self.duration * change)
+        fastest = jnp.max(jnp.abs(problem.unpacked(self.y0)[1] / units), initial=0.0)
+        of_q, of_v = of_q / units / (rtol + atol), of_v / units / (rtol * fastest + atol)
+        return jnp.max(jnp.abs(jnp.concatenate([of_q, of_v])), initial=0.0)
+
+
 class Projected(diffrax.AbstractAdaptiveSolver):
     """Any diffrax solver, with the state put back on the closed loops after each step.
 
@@ -132,18 +149,34 @@ class Projected(diffrax.AbstractAdaptiveSolver):
     """
 
     solver: diffrax.AbstractSolver
+    tolerances: tuple[Array, Array] | None
     after_step: bool = eqx.field(static=True)
 
     term_structure: ClassVar = diffrax.AbstractTerm
 
     @staticmethod
-    def around(solver, accuracy, adjoint) -> "Projected":
-        """Wrap a solver. Forward mode needs another kind of loop inside Runge-Kutta steps, which
-        diffrax chooses itself only where it sees the solver."""
+    def around(solver, accuracy, adjoint, control: "MechanismControl") -> "Projected":
+        """Wrap a solver.
+
+        What diffrax hands to a solver only where it sees it, it gets here: the kind of loop inside Runge-Kutta
+        steps that forward mode needs, and the tolerances for the root finder of an implicit one.
+        """
         kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
         if kind and getattr(solver, "scan_kind", kind) is None:
             solver = eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda leaf: leaf is None)
-        return Projected(solver, accuracy.projection in ("both", "step"))
+        finder = getattr(solver, "root_finder", None)
+        # What is no number stands for the tolerances of the step control.
+        lacks = finder is not None and not eqx.is_array_like(finder.rtol)
+        tolerances = control.tolerances((accuracy.rtol, accuracy.atol)) if lacks else None
+        return Projected(solver, tolerances, accuracy.projection in ("both", "step"))
+
+    def _stepping(self, problem, y0, duration):
+        """The solver for one step: its root finder measures what it finds as errors of the step are measured."""
+        if self.tolerances is None:
+            return self.solver
+        finder, norm = self.solver.root_finder, StageNorm(problem, y0, duration, self.tolerances)
+        finder = dataclasses.replace(finder, rtol=0.0, atol=1.0, norm=norm)
+        return dataclasses.replace(self.solver, root_finder=finder)
 
     @property
     def interpolation_cls(self):
@@ -170,7 +203,8 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         inner, leaves, closest = solver_state
         # Solvers that begin with the last derivative of the step before must not where the state has moved since.
         made_jump = True if self.after_step and args.method.moves_after_steps else made_jump
-        y1, error, dense_info, inner, result = self.solver.step(terms, t0, t1, y0, args, inner, made_jump)
+        solver = self._stepping(args, y0, t1 - t0)
+        y1, error, dense_info, inner, result = solver.step(terms, t0, t1, y0, args, inner, made_jump)
         stages = self._stages(dense_info, t1 - t0)
         if self.after_step:
             y1, error, arrives = _corrected(args, t1, y1, error)
@@ -233,6 +267,11 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     def is_adaptive(self) -> bool:
         """Whether the controller inside chooses the steps by their errors."""
         return isinstance(self._innermost, diffrax.AbstractAdaptiveStepSizeController)
+
+    def tolerances(self, otherwise):
+        """Relative and absolute tolerance of the controller inside; others where it has none."""
+        inner = self._innermost
+        return (inner.rtol, inner.atol) if self.is_adaptive else otherwise
 
     @property
     def _innermost(self):

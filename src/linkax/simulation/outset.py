@@ -68,7 +68,7 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     gap = gaps(crossing.configuration)
     small = jnp.sqrt(eps)
     at_rest = crossing.fastest(v) ** 2 <= eps * crossing.fastest(acceleration)
-    off, rank = crossing.along(jnp.where(at_rest, acceleration, v))
+    off, rank = crossing.along(jnp.where(at_rest, acceleration, v), at_rest)
     # Rows that are not quite dependent contradict each other by as much.
     on_branch = jnp.max(jnp.abs(off), initial=0.0) <= ON_BRANCH * method.rank_tolerance
     return Outset(

@@ -97,6 +97,7 @@ def simulate(
     replayed = adjoint is None and _saves_states(saveat) and is_replayable(solver, saveat, event, max_steps)
     if adjoint is None:
         adjoint = diffrax.ForwardMode() if replayed else diffrax.RecursiveCheckpointAdjoint()
+    control = MechanismControl(_traced_tolerances(stepsize_controller))
     # Compiled apart, so that another solver, formulation or saveat compiles no more than it must.
     mechanism, accuracy, outset = _start(mechanism, state, t0, accuracy, dtype)
     found, formulation = _integrate(
@@ -108,8 +109,8 @@ def simulate(
         t1,
         dt0 if dt0 is None else np.asarray(dt0, dtype=np.float64),
         saveat,
-        Projected.around(solver, accuracy, adjoint),
-        MechanismControl(_traced_tolerances(stepsize_controller)),
+        Projected.around(solver, accuracy, adjoint, control),
+        control,
         adjoint,
         replayed,
         event,

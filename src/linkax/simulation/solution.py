@@ -5,11 +5,13 @@ from typing import Any, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
+from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number
 from linkax.simulation.accuracy import BALANCED, Accuracy
@@ -78,17 +80,18 @@ class Solution(eqx.Module):
     def position(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
         """Position of a body's centre of mass, or of the point `at` on it [m].
 
-        `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m].
+        `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m]. On a beam,
+        "base", "tip", a distance along the axis [m], or [x, y, z] off it.
         """
-        return _over_times(Instant.position, self, self._body(body), self._point(body, at))
+        return self._of_point(Instant.position, body, at)
 
     def velocity(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
         """Velocity of a body's centre of mass, or of the point `at` on it [m/s]."""
-        return _over_times(Instant.velocity, self, self._body(body), self._point(body, at))
+        return self._of_point(Instant.velocity, body, at)
 
     def acceleration(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
         """Acceleration of a body's centre of mass, or of the point `at` on it [m/s²]."""
-        return _over_times(Instant.acceleration, self, self._body(body), self._point(body, at))
+        return self._of_point(Instant.acceleration, body, at)
 
     def orientation(self, body: str) -> Float[Array, "*batch n_t 3 3"]:
         """Axes of a body's reference frame, as columns."""
@@ -105,6 +108,13 @@ class Solution(eqx.Module):
     def joint_speed(self, name: str) -> Float[Array, "..."]:
         """Speed of a joint, in the tree or cut [rad/s or m/s]."""
         return self._joint(Instant.joint_speed, name)
+
+    def strain(self, beam: str) -> Float[Array, "*batch n_t n 6"]:
+        """Strains of a beam at its nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
+        found = self.mechanism.body(beam)
+        if not isinstance(found, Beam):
+            raise ValueError(f"body {beam!r} is no beam, and has no strain")
+        return found.strain(self.joint(beam))
 
     def reaction(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
         """What a joint or a constraint does.
@@ -209,17 +219,29 @@ class Solution(eqx.Module):
         return Reaction(force[..., index, :], moment[..., index, :])
 
     def _body(self, name):
-        self.mechanism.body(name)
+        if isinstance(self.mechanism.body(name), Beam):
+            some = ", ".join(map(repr, self.mechanism.body(name).sections[:3]))
+            raise ValueError(f"{name!r} is a beam and bends; ask for one of its sections, {some}, ...")
         return self.mechanism.topology.bodies.index(name)
 
-    def _point(self, body, at):
-        found = self.mechanism.body(body)
+    def _of_point(self, function, body, at):
+        """A function of an `Instant` for a point of a rigid body or of a beam."""
+        found, names = self.mechanism.body(body), self.mechanism.topology.bodies
+        if isinstance(found, Beam) and at is None:
+            return _over_times(Instant.center_of_mass, self, function, tuple(map(names.index, found.sections)))
         if at is None:
-            return found.center_of_mass
+            return _over_times(function, self, names.index(body), found.center_of_mass)
         if isinstance(at, str):
-            return found.at(at).offset
-        offset = number(at, (3,), f"point on body {body!r} [m]")
-        return jnp.broadcast_to(offset, (*self.ts.shape[:-1], 3))
+            frame = found.at(at)
+            offset = jnp.broadcast_to(frame.offset, (*self.ts.shape[:-1], 3))
+            return _over_times(function, self, names.index(frame.body), offset)
+        what = f"point on body {body!r} [m]"
+        if isinstance(found, Beam) and np.ndim(at) == 0:
+            at = number(at, (), what) * np.eye(3)[0]
+        offset = jnp.broadcast_to(number(at, (3,), what), (*self.ts.shape[:-1], 3))
+        if isinstance(found, Beam):
+            return _over_times(Instant.on_beam, self, function, found, offset)
+        return _over_times(function, self, names.index(body), offset)
 
     def _joint(self, function, name):
         self.mechanism.joint(name)

@@ -1,6 +1,7 @@
 """What every joint type says of itself."""
 
 import abc
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
@@ -9,7 +10,36 @@ from jaxtyping import Array, Float
 
 from linkax.model.bodies import Frame, frame_of
 from linkax.model.numbers import Constant, perpendicular_axis, unit_axis, value
+from linkax.model.terms import Term
 from linkax.spatial.rotations import frame_about_axis, rotation_about_first_axis
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion(abc.ABC):
+    """The motion of a joint in the tree, as a pure function that JAX differentiates."""
+
+    @abc.abstractmethod
+    def __call__(self, coordinates: Float[Array, " n"], numbers: Float[Array, " k"]):
+        """The child's frame seen from the parent's, in joint axes, (4, 4), see `linkax.spatial.screws`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointKind:
+    """What a topology keeps of a joint in the tree that has a `Motion`; compared by value.
+
+    It says what the class of another joint says of itself, see `AbstractJoint`.
+    """
+
+    name: str
+    motion: Motion
+    speed_units: tuple[str, ...]
+
+    has_quaternion: ClassVar[bool] = False
+    is_screw: ClassVar[bool] = False
+
+    @property
+    def __name__(self):
+        return self.name
 
 
 class AbstractJoint(eqx.Module):
@@ -37,6 +67,8 @@ class AbstractJoint(eqx.Module):
     is_screw: ClassVar[bool] = False
     # The angular part for joints whose axes turn with their own coordinates: (coordinates) -> (n, 3).
     angular_subspace_at: ClassVar = None
+    # All of the motion, for joints that bend with other coordinates than their own; see `Motion`.
+    motion: ClassVar = None
     # Pairs (i, j), counted from 0, of axes that stay orthogonal: parent's hⁱ and child's hʲ.
     locked_rotations: ClassVar[tuple[tuple[int, int], ...]]
     # Axes, counted from 0, that point the same way on both; locked rotations alone allow a flip.
@@ -84,6 +116,26 @@ class AbstractJoint(eqx.Module):
     def num_coordinates(self) -> int:
         """Number of coordinates: of speeds, and one more where a quaternion is among them."""
         return len(self.speed_units) + self.has_quaternion
+
+    @property
+    def kind(self):
+        """What a topology keeps of this joint: its type, or what says the same of it."""
+        return type(self)
+
+    @property
+    def movers(self) -> tuple[Term, ...] | None:
+        """Whose coordinates move it, in the order that its `motion` reads them; None for its own alone."""
+        return None
+
+    @property
+    def numbers(self) -> Float[Array, " k"] | None:
+        """The numbers that its `motion` needs."""
+        return None
+
+    @property
+    def reach(self):
+        """About how far its `motion` takes the child from the parent [m]."""
+        return 0.0
 
     @property
     def number(self):

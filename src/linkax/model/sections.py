@@ -1,0 +1,192 @@
+"""Cross-sections of beams: from stiffnesses, or from a profile and a material."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from linkax.model.numbers import number, require
+
+
+def positive(entry, what):
+    """A positive number."""
+    return require(number(entry, (), what), lambda x: x > 0.0, what, "it must be positive")
+
+
+class Material(eqx.Module):
+    """An isotropic elastic material.
+
+    - `youngs_modulus` E [Pa], `poissons_ratio` ν, `density` ρ [kg/m³].
+
+    **Raises:** `ValueError` for a modulus or a density that is not positive, and for ν outside (−1, 0.5].
+    """
+
+    youngs_modulus: Float[Array, ""]
+    poissons_ratio: Float[Array, ""]
+    density: Float[Array, ""]
+
+    def __init__(self, youngs_modulus, poissons_ratio, density):
+        self.youngs_modulus = positive(youngs_modulus, "material: youngs_modulus [Pa]")
+        what = "material: poissons_ratio"
+        ratio = number(poissons_ratio, (), what)
+        self.poissons_ratio = require(ratio, lambda x: -1.0 < x <= 0.5, what, "it must be in (-1, 0.5]")
+        self.density = positive(density, "material: density [kg/m³]")
+
+    @property
+    def shear_modulus(self) -> Float[Array, ""]:
+        """G = E / 2(1 + ν) [Pa]."""
+        return self.youngs_modulus / (2.0 * (1.0 + self.poissons_ratio))
+
+
+class Section(eqx.Module):
+    """The cross-section of a beam along x, in principal axes y and z through its centroid.
+
+    **Arguments:**
+
+    - `bending_stiffness`: E I_y and E I_z [N m²], against bending about y (deflection along z) and about z
+      (deflection along y); one number for both.
+    - `linear_density`: ρ A [kg/m].
+    - `axial_stiffness`: E A [N]; needed by beams that stretch.
+    - `torsional_stiffness`: G J [N m²]; needed by beams that twist.
+    - `shear_stiffness`: k G A along y and z [N], k the shear coefficient; one number for both; needed by
+      beams that shear.
+    - `rotary_inertia`: ρ I_y and ρ I_z [kg m]; one number for both. Default: of a uniform material,
+      ρ A × E I / E A, and none where `axial_stiffness` is not given.
+
+    **Raises:** `ValueError` for a stiffness or a density that is not positive, and for a negative inertia.
+    """
+
+    bending_stiffness: Float[Array, "2"]
+    linear_density: Float[Array, ""]
+    axial_stiffness: Float[Array, ""] | None
+    torsional_stiffness: Float[Array, ""] | None
+    shear_stiffness: Float[Array, "2"] | None
+    rotary_inertia: Float[Array, "2"]
+
+    def __init__(
+        self,
+        bending_stiffness,
+        linear_density,
+        axial_stiffness=None,
+        torsional_stiffness=None,
+        shear_stiffness=None,
+        rotary_inertia=None,
+    ):
+        self.bending_stiffness = _both(bending_stiffness, "section: bending_stiffness [N m²]")
+        self.linear_density = positive(linear_density, "section: linear_density [kg/m]")
+        given = lambda entry, check, what: None if entry is None else check(entry, f"section: {what}")
+        self.axial_stiffness = given(axial_stiffness, positive, "axial_stiffness [N]")
+        self.torsional_stiffness = given(torsional_stiffness, positive, "torsional_stiffness [N m²]")
+        self.shear_stiffness = given(shear_stiffness, _both, "shear_stiffness [N]")
+        if rotary_inertia is not None:
+            what = "section: rotary_inertia [kg m]"
+            pair = _pair(rotary_inertia, what)
+            self.rotary_inertia = require(pair, lambda x: np.all(x >= 0.0), what, "it must be zero or more")
+        elif self.axial_stiffness is not None:
+            self.rotary_inertia = self.linear_density * self.bending_stiffness / self.axial_stiffness
+        else:
+            self.rotary_inertia = np.zeros(2)
+
+    def stiffness(self, strain: int):
+        """The stiffness against one component of strain: twist, bending about y and z, stretch, shear along y and z."""
+        of_strain = [
+            self.torsional_stiffness,
+            self.bending_stiffness[0],
+            self.bending_stiffness[1],
+            self.axial_stiffness,
+            None if self.shear_stiffness is None else self.shear_stiffness[0],
+            None if self.shear_stiffness is None else self.shear_stiffness[1],
+        ]
+        return of_strain[strain]
+
+
+def _pair(entry, what):
+    """Two numbers, or one for both."""
+    single = np.ndim(entry) == 0
+    return number([entry, entry] if single else entry, (2,), what)
+
+
+def _both(entry, what):
+    return require(_pair(entry, what), lambda x: np.all(x > 0.0), what, "it must be positive")
+
+
+def _of_profile(material, area, second_moments, torsion_constant, shear_coefficients) -> Section:
+    """A section of one material; `second_moments` of area about y and z [m⁴]."""
+    young, shear, density = material.youngs_modulus, material.shear_modulus, material.density
+    moments = jnp.stack(jnp.broadcast_arrays(*second_moments))
+    return Section(
+        bending_stiffness=young * moments,
+        linear_density=density * area,
+        axial_stiffness=young * area,
+        torsional_stiffness=shear * torsion_constant,
+        shear_stiffness=shear * area * jnp.stack(jnp.broadcast_arrays(*shear_coefficients)),
+        rotary_inertia=density * moments,
+    )
+
+
+def _wall(thickness, most, what):
+    remedy = f"it must be positive, and less than half of the profile, {most}"
+    return require(number(thickness, (), what), lambda metres: 0.0 < metres < most, what, remedy)
+
+
+def rectangle(width, height, material: Material, thickness=None) -> Section:
+    """A rectangular profile, solid or hollow: `width` along y, `height` along z, wall `thickness` [m].
+
+    Torsion constant: Bredt's formula for thin walls (Young and Budynas, Roark's Formulas for Stress
+    and Strain, 7th ed., table 10.1), a series there for solid ones. Shear coefficients: Cowper,
+    Journal of Applied Mechanics 33 (1966), for thin-walled boxes and for solid rectangles.
+
+    **Raises:** `ValueError` for a size that is not positive, and for walls that do not fit.
+    """
+    width, height = positive(width, "rectangle: width [m]"), positive(height, "rectangle: height [m]")
+    ratio = material.poissons_ratio
+    if thickness is None:
+        long, short = jnp.maximum(width, height), jnp.minimum(width, height)
+        slimness = short / long
+        torsion = long * short**3 / 16.0 * (16.0 / 3.0 - 3.36 * slimness * (1.0 - slimness**4 / 12.0))
+        shear = 10.0 * (1.0 + ratio) / (12.0 + 11.0 * ratio)
+        second_moments = width * height**3 / 12.0, height * width**3 / 12.0
+        return _of_profile(material, width * height, second_moments, torsion, (shear, shear))
+    most = np.minimum(width, height) / 2 if isinstance(width, np.ndarray) else jnp.inf
+    thickness = _wall(thickness, most, "rectangle: thickness [m]")
+    inner_width, inner_height = width - 2.0 * thickness, height - 2.0 * thickness
+    second_moments = (
+        (width * height**3 - inner_width * inner_height**3) / 12.0,
+        (height * width**3 - inner_height * inner_width**3) / 12.0,
+    )
+    across, along = width - thickness, height - thickness  # of the middle of the walls
+    torsion = 2.0 * thickness * across**2 * along**2 / (across + along)
+    area = width * height - inner_width * inner_height
+    shears = _box_shear(across, along, ratio), _box_shear(along, across, ratio)
+    return _of_profile(material, area, second_moments, torsion, (shears[1], shears[0]))
+
+
+def _box_shear(width, height, ratio):
+    """Cowper's shear coefficient of a thin-walled box for a force along its height."""
+    n = width / height
+    m = n  # × the thickness of the flanges over that of the webs
+    flanges = 12.0 + 72.0 * m + 150.0 * m**2 + 90.0 * m**3 + ratio * (11.0 + 66.0 * m + 135.0 * m**2 + 90.0 * m**3)
+    across = 10.0 * n**2 * ((3.0 + ratio) * m + 3.0 * m**2)
+    return 10.0 * (1.0 + ratio) * (1.0 + 3.0 * m) ** 2 / (flanges + across)
+
+
+def circle(diameter, material: Material, thickness=None) -> Section:
+    """A circular profile, solid or a tube: outer `diameter`, wall `thickness` [m].
+
+    Shear coefficient: Cowper, Journal of Applied Mechanics 33 (1966).
+
+    **Raises:** `ValueError` for a size that is not positive, and for walls that do not fit.
+    """
+    diameter = positive(diameter, "circle: diameter [m]")
+    inner = 0.0 * diameter
+    if thickness is not None:
+        most = diameter / 2 if isinstance(diameter, np.ndarray) else jnp.inf
+        inner = diameter - 2.0 * _wall(thickness, most, "circle: thickness [m]")
+    second_moment = math.pi / 64.0 * (diameter**4 - inner**4)
+    ratio, hollow = material.poissons_ratio, (inner / diameter) ** 2
+    squared = (1.0 + hollow) ** 2
+    shear = 6.0 * (1.0 + ratio) * squared / ((7.0 + 6.0 * ratio) * squared + (20.0 + 12.0 * ratio) * hollow)
+    area = math.pi / 4.0 * (diameter**2 - inner**2)
+    return _of_profile(material, area, (second_moment, second_moment), 2.0 * second_moment, (shear, shear))

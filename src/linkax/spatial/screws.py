@@ -1,0 +1,79 @@
+"""Rigid motions, (..., 4, 4), and the screws whose exponentials they are.
+
+A motion takes points (p, 1) to (R p + d, 1), R the rotation, axes as columns, d the translation. A screw is a
+turn and an advance, (..., 6), or the matrix of both. Everything is smooth at every argument, and made of
+few operations, since beams differentiate it several times.
+"""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+TERMS = 16  # enough for turns of π to rounding
+# (1 − cos a) / a² and (a − sin a) / a³ as power series in a².
+SERIES = np.array([[(-1.0) ** k / math.factorial(2 * k + 2 + i) for i in range(2)] for k in range(TERMS)])
+
+LEVI_CIVITA = np.array([[[(i - j) * (j - k) * (k - i) / 2.0 for k in range(3)] for j in range(3)] for i in range(3)])
+GENERATORS = np.zeros((6, 4, 4))
+GENERATORS[:3, :3, :3] = -LEVI_CIVITA
+GENERATORS[[3, 4, 5], [0, 1, 2], 3] = 1.0
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _series(order: int, x):
+    """Both series, or derivatives of that order, (..., 2); in few operations, whatever the order."""
+    coefficients = np.zeros_like(SERIES)
+    coefficients[: TERMS - order] = SERIES[order:]
+    coefficients *= np.array([math.perm(k + order, order) for k in range(TERMS)])[:, None]
+    powers, square = jnp.stack([jnp.ones_like(x), x], axis=-1), x
+    while powers.shape[-1] < TERMS:
+        square = square * square
+        powers = jnp.concatenate([powers, square[..., None] * powers], axis=-1)
+    return powers @ jnp.asarray(coefficients, x.dtype)
+
+
+@_series.defjvp
+def _series_jvp(order, primals, changes):
+    (x,), (change,) = primals, changes
+    return _series(order, x), _series(order + 1, x) * change[..., None]
+
+
+def product(first, second):
+    """The product of matrices (..., n, n): of two motions, the second one seen from the first."""
+    return first @ second
+
+
+def screw_matrix(screw):
+    """The matrices (..., 4, 4) of screws (..., 6)."""
+    return jnp.tensordot(screw, jnp.asarray(GENERATORS, screw.dtype), 1)
+
+
+def exponential(screw):
+    """The motion (Rodrigues) along a constant screw, given as its matrix (..., 4, 4)."""
+    square = product(screw, screw)
+    # The trace is −2 a².
+    series = _series(0, -jnp.trace(square, axis1=-2, axis2=-1) / 2.0)[..., None, None]
+    return (
+        jnp.eye(4, dtype=screw.dtype)
+        + screw
+        + series[..., 0, :, :] * square
+        + series[..., 1, :, :] * product(square, screw)
+    )
+
+
+def turn_rate(change, rotation):
+    """The vector (..., 3) of the antisymmetric part of change × rotationᵀ: the angular velocity of a rate of change."""
+    across = change @ jnp.swapaxes(rotation, -1, -2)
+    return jnp.tensordot(across, jnp.asarray(np.swapaxes(LEVI_CIVITA, 0, 2) / 2.0, across.dtype), 2)
+
+
+def chain(motions):
+    """The product of motions (n, 4, 4), each seen from the one before."""
+    while len(motions) > 1:
+        if len(motions) % 2:
+            motions = jnp.concatenate([motions, jnp.eye(4, dtype=motions.dtype)[None]])
+        motions = product(motions[::2], motions[1::2])
+    return motions[0]
