@@ -120,10 +120,6 @@ def floating(seed):
     return lx.Mechanism(bodies, joints, forces)
 
 
-def _wave(numbers, t):
-    return numbers * jnp.sin(t)
-
-
 def driven(seed):
     """A drive and a coupling in loops that share joints, under all forces along joints."""
     numbers = Numbers(seed)
@@ -154,6 +150,10 @@ def _restoring(factor, t, motion):
     return -factor * motion.joint("table")[0] * jnp.cos(t) + motion.joint_speed("slide")
 
 
+def _wave(numbers, t):
+    return numbers * jnp.sin(t)
+
+
 def bending(seed):
     """Two beams in a loop, one held by its tip: attachments along and off their axes, and a sleeve that slides."""
     numbers = Numbers(seed)
@@ -176,7 +176,13 @@ def bending(seed):
         lx.JointSpring("slide", 1.5, 0.2),
         lx.PointForce(every.at("base"), [1.0, 2.0, 3.0], axes="frame"),
     ]
-    return lx.Mechanism([every, slender, body, sleeve], joints, forces)
+    around = [lx.GROUND.at(numbers.vector()), every.at("tip"), along(slender, 0.1, 0.0), sleeve]
+    forces.append(lx.ElasticRope(around, 2.0, 0.1))
+    ropes = [
+        lx.Rope("rope", around[::-1], numbers.positive()),
+        lx.Rope("winch", around[1:3], jax.tree_util.Partial(_wave, numbers.positive())),
+    ]
+    return lx.Mechanism([every, slender, body, sleeve], joints, forces, ropes)
 
 
 POOL = {

@@ -62,6 +62,8 @@ from linkax.model.joints.screw import Screw as Screw  # noqa: E402
 from linkax.model.joints.spherical import Spherical as Spherical  # noqa: E402
 from linkax.model.joints.universal import Universal as Universal  # noqa: E402
 from linkax.model.mechanism import Mechanism as Mechanism  # noqa: E402
+from linkax.model.ropes import ElasticRope as ElasticRope  # noqa: E402
+from linkax.model.ropes import Rope as Rope  # noqa: E402
 from linkax.model.sections import Material as Material  # noqa: E402
 from linkax.model.sections import Section as Section  # noqa: E402
 from linkax.model.sections import circle as circle  # noqa: E402

@@ -103,6 +103,10 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     power = jnp.sum(cut.force * (velocity(child, configuration.child_arm[joints]) - on_parent))
     power += jnp.sum(cut.moment * (motion.angular_velocity[child] - motion.angular_velocity[parent]))
     of_coordinates = multipliers[topology.num_rows - len(system.constraints) :]
+    for row, rope in loops.ropes(system):
+        pull = rope.load(configuration, of_coordinates[row] / system.coupling_unit[row])
+        at_mass = motion.velocity[:-1] + cross(motion.angular_velocity[:-1], configuration.center_of_mass())
+        power += jnp.sum(pull.force * at_mass + pull.moment * motion.angular_velocity[:-1])
     asked = (system.coupling / system.coupling_unit[:, None]).T @ of_coordinates
     body = topology.moved_body
     sign = jnp.where(topology.reversed[body], -1.0, 1.0)[:, None]
@@ -124,7 +128,9 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     energy = along(lambda t, q, v: kinetic_energy(system, t, q, v), solved)
     stored = along(lambda t, q, v: dynamics.potential_energy(configure(system, t, q)), solved)
     storing = [
-        force for force in system.forces if isinstance(force, (lx.Gravity, lx.Spring, lx.JointSpring, BeamElasticity))
+        force
+        for force in system.forces
+        if isinstance(force, (lx.Gravity, lx.Spring, lx.JointSpring, lx.ElasticRope, BeamElasticity))
     ]
     loads = reduce(lx.Load.plus, [force.load(t, motion) for force in storing], lx.Load.none(system))
     released = loads.joint_force + dynamics.along_speeds(configuration, loads.force, loads.moment)

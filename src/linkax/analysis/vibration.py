@@ -19,7 +19,6 @@ from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
-from linkax.model.constraints import Coupling
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import all_known, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
@@ -48,12 +47,7 @@ class EquilibriumError(RuntimeError):
 def _held_system(mechanism, dtype, t) -> System:
     """The mechanism's numbers, with drives that hold their joints where they are at time t."""
     system = system_of(mechanism, dtype)
-    held = [
-        Coupling(constraint.name, dict(zip(constraint.terms, constraint.coefficients, strict=True)), side)
-        for constraint in system.constraints
-        for side in [constraint.right_side(t)]
-    ]
-    return dataclasses.replace(system, constraints=tuple(held))
+    return dataclasses.replace(system, constraints=tuple(constraint.held(t) for constraint in system.constraints))
 
 
 class _Nearby(eqx.Module):

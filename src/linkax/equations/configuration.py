@@ -15,12 +15,13 @@ from linkax.equations.coordinates import by_speed
 from linkax.equations.system import System
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame
+from linkax.model.forces import Load
 from linkax.model.numbers import value
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.screws import turn_rate
-from linkax.spatial.vectors import cross
+from linkax.spatial.vectors import cross, dot
 from linkax.tracing import differentiated_whole, traced_once
 
 
@@ -103,6 +104,18 @@ class Configuration(eqx.Module):
         (near, near_anchor), (far, far_anchor) = self._place(first), self._place(second)
         return (far - near) + (far_anchor - near_anchor)
 
+    def point_load(self, frame: Frame, force, moment=0.0) -> Load:
+        """A force at the origin of a frame, and a moment, in ground axes [N, N m]; on the ground they do nothing."""
+        return self.wrench(self.body(frame.body), self.arm(frame), force, moment)
+
+    def wrench(self, body: int, arm, force, moment) -> Load:
+        """A force at a point of a body, and a moment."""
+        none = Load.none(self.system)
+        if body == GROUND_INDEX:
+            return none
+        about_mass = moment + cross(arm - self.center_of_mass()[body], force)
+        return none._replace(force=none.force.at[body].set(force), moment=none.moment.at[body].set(about_mass))
+
     def joint_coordinates(self, name: str) -> Float[Array, " n"]:
         """Coordinates of a joint, in the tree or cut [rad or m]."""
         topology = self.system.topology
@@ -177,6 +190,15 @@ def by_speed_of(topology, motions):
         return motions
     nothing = jnp.zeros((*motions.shape[:-1], topology.num_speeds), motions.dtype)
     return nothing.at[..., topology.motion_column].add(motions)
+
+
+def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " n_v"]:
+    """Generalised force of wrenches on bodies, (n_b, 3) each, the moment about the centre of mass."""
+    system, topology = configuration.system, configuration.system.topology
+    body = topology.moved_body
+    arm = configuration.position[:-1] + configuration.center_of_mass()
+    force, moment = over_subtree(system, force), over_subtree(system, moment + cross(arm, force))
+    return by_speed_of(topology, dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body]))
 
 
 def beam_point(configuration: Configuration, beam: Beam, point) -> Float[Array, "3"]:

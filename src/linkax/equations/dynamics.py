@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, by_body, by_speed_of, of_motions, over_subtree
+from linkax.equations.configuration import Configuration, along_speeds, by_body, by_speed_of, of_motions, over_subtree
 from linkax.equations.motion import Motion
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
@@ -81,15 +81,6 @@ def inertial_wrench(motion: Motion, angular_acceleration, acceleration):
     inertia = world_inertia(motion.configuration)
     moment = rotate(inertia, angular_acceleration) + cross(omega, rotate(inertia, omega))
     return system.mass[:, None] * at_mass, moment
-
-
-def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " n_v"]:
-    """Generalised force of wrenches on bodies, (n_b, 3) each, the moment about the centre of mass."""
-    system, topology = configuration.system, configuration.system.topology
-    body = topology.moved_body
-    arm = configuration.position[:-1] + configuration.center_of_mass()
-    force, moment = over_subtree(system, force), over_subtree(system, moment + cross(arm, force))
-    return by_speed_of(topology, dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body]))
 
 
 def generalised_force(motion: Motion) -> Float[Array, " n_v"]:

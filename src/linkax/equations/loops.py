@@ -3,7 +3,7 @@
 Rows of cut joints are those of the paper's Table 1: with h₁ⁱ, h₂ʲ the joint's axes on parent and
 child and s the separation of their origins, a rotation row is h₁ⁱ·h₂ʲ and a translation row
 h₁ⁱ·s / ℓ, ℓ half the way around the loop. Some joint types combine several of these in one row. The
-last rows are constraints on coordinates of the tree, in radians and lengths of the mechanism.
+last rows are constraints on coordinates of the tree and ropes, in radians and lengths of the mechanism.
 """
 
 from typing import NamedTuple
@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, bodies_of_cuts, by_speed_of
+from linkax.equations.configuration import Configuration, along_speeds, bodies_of_cuts, by_speed_of
 from linkax.equations.coordinates import by_speed
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
-from linkax.model.constraints import Drive
+from linkax.model.ropes import Rope
 from linkax.spatial.rotations import rotate, transpose
 from linkax.spatial.vectors import cross, dot
 from linkax.tracing import traced_once
@@ -99,8 +99,13 @@ def _right_sides(system: System, t):
 
 
 def is_driven(system: System) -> bool:
-    """Whether a drive moves the mechanism with time."""
-    return any(isinstance(constraint, Drive) for constraint in system.constraints)
+    """Whether a constraint moves the mechanism with time."""
+    return any(constraint.is_driven for constraint in system.constraints)
+
+
+def ropes(system: System) -> list[tuple[int, Rope]]:
+    """The ropes, and which of the constraints they are."""
+    return [(row, rope) for row, rope in enumerate(system.constraints) if isinstance(rope, Rope)]
 
 
 def residual(configuration: Configuration) -> Float[Array, " m"]:
@@ -111,7 +116,10 @@ def residual(configuration: Configuration) -> Float[Array, " m"]:
         rows.append(_combine(system, _residual(configuration, combined_rows(configuration))))
     if system.constraints:
         coordinates = by_speed(system.topology, configuration.q)
-        rows.append(system.coupling @ coordinates / system.coupling_unit - _right_sides(system, configuration.t))
+        values = system.coupling @ coordinates
+        for row, rope in ropes(system):
+            values = values.at[row].set(rope.value(configuration))
+        rows.append(values / system.coupling_unit - _right_sides(system, configuration.t))
     return jnp.concatenate(rows)
 
 
@@ -157,7 +165,11 @@ def jacobian(configuration: Configuration) -> Float[Array, "m n_v"]:
         values, slopes = _combination(configuration)
         rows.append(_combining_factors(configuration, values) @ slopes)
     if system.constraints:
-        rows.append(system.coupling / system.coupling_unit[:, None])
+        slopes = system.coupling
+        for row, rope in ropes(system):
+            unit_load = rope.load(configuration, 1.0)
+            slopes = slopes.at[row].set(along_speeds(configuration, unit_load.force, unit_load.moment))
+        rows.append(slopes / system.coupling_unit[:, None])
     return jnp.concatenate(rows)
 
 
@@ -225,7 +237,10 @@ def bias(motion: Motion) -> Float[Array, " m"]:
         factors = _combining_factors(configuration, values)
         rows.append(factors @ _bias(motion, combined_rows(configuration)) - bent)
     if system.constraints:
-        rows.append(jnp.zeros(len(system.constraints), system.dtype))
+        biases = jnp.zeros(len(system.constraints), system.dtype)
+        for row, rope in ropes(system):
+            biases = biases.at[row].set(rope.bias(motion) / system.coupling_unit[row])
+        rows.append(biases)
     return jnp.concatenate(rows)
 
 
@@ -238,7 +253,8 @@ class Multipliers(NamedTuple):
     """Multipliers sorted by what they act on.
 
     - `plain`, `combined`: of the rows of cut joints in `plain_rows` and `combined_rows`.
-    - `constraints`: generalised force of each constraint on coordinates, per unit of coefficient.
+    - `constraints`: generalised force of each constraint on coordinates, per unit of coefficient; of ropes their
+      tension.
     """
 
     plain: Float[Array, " n"]

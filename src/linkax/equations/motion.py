@@ -13,7 +13,6 @@ from linkax.equations.system import System
 from linkax.model.bodies import Frame
 from linkax.model.forces import Load
 from linkax.model.terms import Term
-from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import rotate
 from linkax.spatial.screws import turn_rate
 from linkax.spatial.vectors import cross
@@ -80,25 +79,23 @@ class Motion(eqx.Module):
         parent, child, cut = topology.parent[joint], topology.child[joint], joint - topology.num_bodies
         angular, linear = (columns[term.index or 0] * force for columns in configuration.cut_subspace(term.joint))
         on_parent = configuration.parent_arm[joint] + configuration.separation[cut]
-        load = self._wrench(child, configuration.child_arm[joint], linear, angular)
-        return load.plus(self._wrench(parent, on_parent, -linear, -angular))
+        load = configuration.wrench(child, configuration.child_arm[joint], linear, angular)
+        return load.plus(configuration.wrench(parent, on_parent, -linear, -angular))
 
     def point_velocity(self, frame: Frame) -> Float[Array, "3"]:
         """Velocity of the origin of a frame [m/s]."""
         body = self.configuration.body(frame.body)
         return self.velocity[body] + cross(self.angular_velocity[body], self.configuration.arm(frame))
 
+    def point_bias(self, frame: Frame) -> Float[Array, "3"]:
+        """Acceleration of the origin of a frame that velocities alone cause [m/s²]."""
+        body, arm = self.configuration.body(frame.body), self.configuration.arm(frame)
+        omega = self.angular_velocity[body]
+        return self.bias[body] + cross(self.angular_bias[body], arm) + cross(omega, cross(omega, arm))
+
     def point_load(self, frame: Frame, force, moment=0.0) -> Load:
         """A force at the origin of a frame, and a moment, in ground axes [N, N m]; on the ground they do nothing."""
-        return self._wrench(self.configuration.body(frame.body), self.configuration.arm(frame), force, moment)
-
-    def _wrench(self, body, arm, force, moment) -> Load:
-        """A force at a point of a body, and a moment."""
-        none = Load.none(self.system)
-        if body == GROUND_INDEX:
-            return none
-        about_mass = moment + cross(arm - self.configuration.center_of_mass()[body], force)
-        return none._replace(force=none.force.at[body].set(force), moment=none.moment.at[body].set(about_mass))
+        return self.configuration.point_load(frame, force, moment)
 
 
 def _alone(values):

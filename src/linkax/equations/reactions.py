@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from linkax.equations.configuration import Configuration, bodies_of_cuts, by_body, of_motions, over_subtree
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
-from linkax.equations.loops import Rows, combined_rows, immobile_rows, plain_rows, sorted_multipliers
+from linkax.equations.loops import Rows, combined_rows, immobile_rows, plain_rows, ropes, sorted_multipliers
 from linkax.equations.motion import Motion
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
@@ -93,7 +93,11 @@ def _carried(configuration: Configuration, needed: Load, cut: Reaction, multipli
     system, topology = configuration.system, configuration.system.topology
     count = topology.num_bodies
     force, moment, joint_force = needed
-    joint_force = joint_force + sorted_multipliers(configuration, multipliers).constraints @ system.coupling
+    asked = sorted_multipliers(configuration, multipliers).constraints
+    joint_force = joint_force + asked @ system.coupling
+    for row, rope in ropes(system):
+        of_rope = rope.load(configuration, asked[row])
+        force, moment = force - of_rope.force, moment - of_rope.moment
     moment = moment + cross(configuration.position[:-1] + configuration.center_of_mass(), force)
 
     # All moments about the anchor of each body's tree from here on.

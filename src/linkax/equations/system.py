@@ -6,7 +6,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from linkax.model.constraints import AbstractConstraint
+from linkax.model.constraints import AbstractConstraint, LinearConstraint
 from linkax.model.forces import AbstractForce
 from linkax.model.joints.joint import Motion
 from linkax.model.mechanism import Mechanism
@@ -28,7 +28,7 @@ class System(eqx.Module):
     - `loop_length` [m] (n_cut,): half the way around each loop, the unit of its translation rows.
     - `length` [m]: the mechanism's length, the unit of sliding coordinates.
     - `coupling` (k, n_v): coefficients of the constraints on coordinates of the tree, and
-      `coupling_unit` (k,): the largest of each, in radians and lengths of the mechanism.
+      `coupling_unit` (k,): the largest of each, in radians and lengths of the mechanism; `length` for ropes.
     """
 
     topology: Topology = eqx.field(static=True)
@@ -101,7 +101,7 @@ def system_of(mechanism: Mechanism, dtype, fixed_units: bool = True) -> System:
         loop_length=loop_length,
         length=length,
         coupling=coupling,
-        coupling_unit=jnp.max(jnp.abs(fixed(coupling)) * slides, axis=1),
+        coupling_unit=_coupling_unit(mechanism, fixed(coupling) * slides, length),
         constraints=mechanism.constraints,
         forces=mechanism.forces,
     )
@@ -112,9 +112,16 @@ def _coupling(mechanism, dtype):
     topology, constraints = mechanism.topology, mechanism.constraints
     coupling = jnp.zeros((len(constraints), topology.num_speeds), dtype)
     for row, constraint in enumerate(constraints):
-        columns = np.array([topology.column(term) for term in constraint.terms])
-        coupling = coupling.at[row, columns].set(jnp.asarray(constraint.coefficients, dtype))
+        if isinstance(constraint, LinearConstraint):
+            columns = np.array([topology.column(term) for term in constraint.terms])
+            coupling = coupling.at[row, columns].set(jnp.asarray(constraint.coefficients, dtype))
     return coupling
+
+
+def _coupling_unit(mechanism, coefficients, length):
+    largest = jnp.max(jnp.abs(coefficients), axis=1)
+    linear = np.array([isinstance(constraint, LinearConstraint) for constraint in mechanism.constraints], dtype=bool)
+    return largest if np.all(linear) else jnp.where(linear, largest, length)
 
 
 def _lengths(topology, parent_offset, child_offset, center_of_mass, bent):

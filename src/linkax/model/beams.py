@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from linkax.model.bodies import AbstractBody, Frame, RigidBody, body_name
+from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce, Load
 from linkax.model.joints.bending import NUM_STRAINS, STATIONS, AlongBeam, BeamSegment, BeamStation, OnBeam
 from linkax.model.joints.joint import AbstractJoint
@@ -232,13 +233,16 @@ class Parts(NamedTuple):
     bodies: list[RigidBody]
     joints: list[AbstractJoint]
     forces: list[AbstractForce]
+    constraints: list[AbstractConstraint]
 
 
-def taken_apart(bodies, joints, forces) -> Parts:
-    """Beams as sections, joints and forces; frames at places along them as massless bodies."""
-    beams = {body.name: body for body in bodies if isinstance(body, Beam)}
+def taken_apart(bodies, joints, forces, constraints) -> Parts:
+    """Beams as sections, joints and forces, where they are not yet; frames at places on them as massless bodies."""
+    names = {body.name for body in bodies}
+    beams = {body.name: body for body in bodies if isinstance(body, Beam) and body.sections[0] not in names}
+    bodies = [body for body in bodies if not isinstance(body, Beam) or body.name in beams]
     if not beams:
-        return Parts(list(bodies), list(joints), list(forces))
+        return Parts(bodies, joints, forces, constraints)
     stations = []
 
     def resolved(frame):
@@ -251,13 +255,14 @@ def taken_apart(bodies, joints, forces) -> Parts:
     with_frames = lambda elements: [
         jax.tree.map(resolved, element, is_leaf=lambda part: isinstance(part, Frame)) for element in elements
     ]
-    joints, forces = with_frames(joints), with_frames(forces)
+    joints, forces, constraints = map(with_frames, (joints, forces, constraints))
     of_beams = beams.values()
     return Parts(
         [part for body in bodies for part in (body._bodies() if isinstance(body, Beam) else [body])]
         + [body for body, _ in stations],
         [*(segment for beam in of_beams for segment in beam._joints()), *(joint for _, joint in stations), *joints],
         [*forces, *map(BeamElasticity, of_beams)],
+        constraints,
     )
 
 

@@ -1,4 +1,4 @@
-"""Constraints on coordinates of joints: gears, ropes over sheaves, drives."""
+"""Constraints besides those of cut joints: gears, ropes over sheaves, drives."""
 
 import abc
 
@@ -8,24 +8,30 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from linkax.model.bodies import Frame
 from linkax.model.functions import Law
 from linkax.model.numbers import known, number
 from linkax.model.terms import Term, term
 
 
 class AbstractConstraint(eqx.Module):
-    """A linear relation between coordinates of joints in the tree: Σ coefficient × coordinate = right side.
-
-    - `terms`: whose coordinates these are.
-    """
+    """One equation: what is constrained = right side. Its multiplier is `Solution.reaction` of its name."""
 
     name: str = eqx.field(static=True)
-    terms: tuple[Term, ...] = eqx.field(static=True)
-    coefficients: Float[Array, " n"]
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Whose coordinates it relates, which go into the spanning tree."""
+        return ()
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """Frames that it attaches to."""
+        return ()
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """The joints that it relates, which go into the spanning tree."""
+        """The joints of `terms`."""
         return tuple(dict.fromkeys(joint for joint, _ in self.terms))
 
     @property
@@ -33,12 +39,38 @@ class AbstractConstraint(eqx.Module):
         """What errors call it."""
         return f"{type(self).__name__.lower()} {self.name!r}"
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether the right side changes with time."""
+        return False
+
     @abc.abstractmethod
     def right_side(self, t) -> Float[Array, ""]:
         """At time t [s]."""
 
+    @abc.abstractmethod
+    def held(self, t) -> "AbstractConstraint":
+        """The same with the right side of time t for ever."""
 
-class Coupling(AbstractConstraint):
+
+class LinearConstraint(AbstractConstraint):
+    """A linear relation between coordinates of joints in the tree: Σ coefficient × coordinate = right side.
+
+    - `related`: whose coordinates these are.
+    """
+
+    related: tuple[Term, ...] = eqx.field(static=True)
+    coefficients: Float[Array, " n"]
+
+    @property
+    def terms(self):
+        return self.related
+
+    def held(self, t):
+        return Coupling(self.name, dict(zip(self.terms, self.coefficients, strict=True)), self.right_side(t))
+
+
+class Coupling(LinearConstraint):
     """A linear relation between joint coordinates, such as gears, a rack, or a rope over sheaves.
 
     `Coupling("gears", {"pinion": 2.0, "wheel": 1.0})` keeps 2 × pinion + wheel = 0. The joints go
@@ -58,10 +90,10 @@ class Coupling(AbstractConstraint):
     offset: Float[Array, ""]
 
     def __init__(self, name: str, coefficients, offset=0.0):
-        self.name = _checked_name(name, "coupling")
+        self.name = checked_name(name, "coupling")
         if not isinstance(coefficients, dict) or not coefficients:
             raise ValueError(f"coupling {name!r}: coefficients are {coefficients!r}; give {{joint: factor, ...}}")
-        self.terms = tuple(term(key, f"coupling {name!r}") for key in coefficients)
+        self.related = tuple(term(key, f"coupling {name!r}") for key in coefficients)
         what = f"coupling {name!r}: coefficients"
         self.coefficients = number(list(coefficients.values()), (len(coefficients),), what)
         if known(self.coefficients) is not None and not np.any(known(self.coefficients)):
@@ -72,7 +104,7 @@ class Coupling(AbstractConstraint):
         return self.offset
 
 
-class Drive(AbstractConstraint):
+class Drive(LinearConstraint):
     """A joint's coordinate prescribed as a function of time. Its reaction is the driving torque.
 
     `Drive("motor", "bearing", lambda t: 2.0 * t)` turns `bearing` at 2 rad/s. The reaction is the
@@ -91,19 +123,24 @@ class Drive(AbstractConstraint):
     motion: Law
 
     def __init__(self, name: str, joint, motion):
-        self.name = _checked_name(name, "drive")
-        self.terms = (term(joint, f"drive {name!r}"),)
+        self.name = checked_name(name, "drive")
+        self.related = (term(joint, f"drive {name!r}"),)
         self.coefficients = np.ones(1)
         if not callable(motion):
             raise ValueError(f"drive {name!r}: motion is {motion!r}; give a function of time, lambda t: ...")
         self.motion = Law(motion, (), f"drive {name!r}")
         jax.eval_shape(self.motion, jnp.zeros(()))
 
+    @property
+    def is_driven(self):
+        return True
+
     def right_side(self, t):
         return self.motion(t)
 
 
-def _checked_name(name, what):
+def checked_name(name, what) -> str:
+    """The name of a constraint, checked."""
     if not isinstance(name, str) or not name:
         raise ValueError(f"{what} name is {name!r}; give a non-empty string")
     return name

@@ -29,7 +29,7 @@ class Mechanism(eqx.Module):
     **Arguments:**
 
     - `bodies`, `joints`, `forces`: sequences; names unique among bodies and among joints.
-    - `constraints`: `Coupling`, `Drive` and `Distance`; names unique among joints and constraints.
+    - `constraints`: `Coupling`, `Drive`, `Rope` and `Distance`; names unique among joints and constraints.
     - `all_rows`: keep those loop rows too that no motion changes, such as the out-of-plane rows of a planar
       loop. It changes no motion; Lagrange multipliers fail on such rows.
 
@@ -46,7 +46,7 @@ class Mechanism(eqx.Module):
 
     def __init__(self, bodies, joints, forces=(), constraints=(), *, all_rows=False):
         constraints = _checked(
-            constraints, (AbstractConstraint, Distance), "constraints", "Coupling, Drive or Distance"
+            constraints, (AbstractConstraint, Distance), "constraints", "Coupling, Drive, Rope or Distance"
         )
         joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
         constraints = [c for c in constraints if not isinstance(c, Distance)]
@@ -56,7 +56,7 @@ class Mechanism(eqx.Module):
             _checked(forces, AbstractForce, "forces", "Force"),
         )
         beams = [body for body in bodies if isinstance(body, Beam)]
-        bodies, joints, forces = taken_apart(bodies, joints, forces)
+        bodies, joints, forces, constraints = taken_apart(bodies, joints, forces, constraints)
         by_name, joint_by_name = _by_name(bodies, "body"), _by_name(joints, "joint")
         _by_name([*joints, *constraints], "joint or constraint")
         _check_references(by_name, joint_by_name, constraints, forces)
@@ -94,11 +94,13 @@ class Mechanism(eqx.Module):
             **split_rows(carriers, predecessors, cuts, all_rows),
             constraints=tuple(constraint.name for constraint in constraints),
             constraint_terms=tuple(constraint.terms for constraint in constraints),
+            constraint_bodies=tuple(tuple(index[f.body] for f in constraint.frames) for constraint in constraints),
         )
 
     def with_all_rows(self) -> "Mechanism":
         """The same mechanism with those loop rows too that no motion changes (see `all_rows`)."""
-        return Mechanism(self.bodies, self.joints, self.forces, self.constraints, all_rows=True)
+        bodies = (*self.bodies, *self.beams)
+        return Mechanism(bodies, self.joints, self.forces, self.constraints, all_rows=True)
 
     def body(self, name: str) -> RigidBody | Beam:
         """The body of that name, a beam or one of its sections too."""
@@ -149,6 +151,7 @@ def _check_references(bodies, joints, constraints, forces):
             check_joint(force.described, name)
             _check_index(force.described, joints[name], index, force.needs_coordinate)
     for constraint in constraints:
+        check_frames(constraint.described, constraint.frames)
         for name, index in constraint.terms:
             check_joint(constraint.described, name)
             _check_index(constraint.described, joints[name], index, True)

@@ -50,7 +50,7 @@ class Topology:
       vanish identically are left out here, and kept in `immobile_rotation_rows` and
       `immobile_translation_rows`.
     - `constraints`: names of the constraints on coordinates of the tree, a row each, and
-      `constraint_terms`: whose coordinates each one relates.
+      `constraint_terms`: whose coordinates each one relates. `constraint_bodies`: those that it attaches to.
 
     Rows of the loop constraints: rotation rows, translation rows, a combined row for each cut
     joint whose type has one, and those of `constraints`.
@@ -69,6 +69,7 @@ class Topology:
     immobile_translation_rows: tuple[tuple[int, int], ...]
     constraints: tuple[str, ...] = ()
     constraint_terms: tuple[tuple[Term, ...], ...] = ()
+    constraint_bodies: tuple[tuple[int, ...], ...] = ()
 
     @property
     def num_bodies(self) -> int:
@@ -200,7 +201,10 @@ class Topology:
         """Parts of the mechanism that neither a loop nor an inertia connects, in the order of their speeds."""
         moving = lambda bodies: np.unique(self.motions[bodies[self.moved_body] != 0.0, 1])
         of_joints = [moving(around) for around in self.loop]
-        of_constraints = [np.array([self.column(term) for term in terms]) for terms in self.constraint_terms]
+        of_constraints = [
+            np.array([*map(self.column, terms), *(c for body in bodies for c in moving(self.path[body]))], dtype=int)
+            for terms, bodies in zip(self.constraint_terms, self.constraint_bodies, strict=True)
+        ]
         plain = [cut for cut, *_ in (*self.rotation_rows, *self.translation_rows)]
         of_rows = [of_joints[cut] for cut in (*plain, *self.combining)] + of_constraints
         carried = [moving(on_path) for on_path in self.path[:-1]]
@@ -255,8 +259,9 @@ class Topology:
             ]
             role = "tree" if index < self.num_bodies else "cut"
             lines.append(f"{role:4} {self.joint_types[index].__name__} {name!r}: {ends[0]} - {ends[1]}")
-        for name, terms in zip(self.constraints, self.constraint_terms, strict=True):
-            lines.append(f"row  {name!r}: {', '.join(repr(term.joint) for term in terms)}")
+        for name, terms, bodies in zip(self.constraints, self.constraint_terms, self.constraint_bodies, strict=True):
+            ends = [GROUND_NAME if body == GROUND_INDEX else self.bodies[body] for body in bodies]
+            lines.append(f"row  {name!r}: {', '.join([*(repr(term.joint) for term in terms), *ends])}")
         return "\n".join(lines)
 
 

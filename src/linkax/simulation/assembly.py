@@ -92,9 +92,9 @@ def _raise_if_open(mechanism, state, t, remainder):
                 raise AssemblyError(f"joint {name!r} does not close: {remains(size, unit)}; {advice}")
     for constraint, size in zip(mechanism.constraints, remainder.gap.constraints, strict=True):
         if not size <= remainder.most:
-            joints = ", ".join(map(repr, constraint.joints))
+            joints = f" of joint {', '.join(map(repr, constraint.joints))}" if constraint.joints else ""
             raise AssemblyError(
-                f"{constraint.described} of joint {joints} is not met at t = {float(t):.6g} s: "
+                f"{constraint.described}{joints} is not met at t = {float(t):.6g} s: "
                 f"{remains(size, 'rad or m')}; {advice}"
             )
     for what, misses in (("position", remainder.positions), ("speed", remainder.speeds)):

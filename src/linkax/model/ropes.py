@@ -1,0 +1,151 @@
+"""Ropes over points of bodies: of a given length, or elastic."""
+
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from linkax.model.bodies import Frame, frame_of
+from linkax.model.constraints import AbstractConstraint, checked_name
+from linkax.model.forces import AbstractForce, Load
+from linkax.model.functions import Law, evaluated
+from linkax.model.numbers import number, require
+from linkax.model.sections import positive
+from linkax.spatial.vectors import dot, length
+
+Points = tuple[Frame, ...]
+
+
+def _points(points, what) -> Points:
+    points = tuple(frame_of(point, f"{what}: a point") for point in points)
+    if len(points) < 2:
+        raise ValueError(f"{what} has {len(points)} points; give two or more, in the order of the rope")
+    if len({point.body for point in points}) == 1:
+        raise ValueError(f"{what}: its points are all on body {points[0].body!r}; give points on two bodies or more")
+    return points
+
+
+def _spans(configuration, points: Points) -> Float[Array, "n 3"]:
+    """From each point to the next [m]."""
+    ends = pairwise(points)
+    return jnp.stack([configuration.between(first, second) for first, second in ends])
+
+
+def _directions(spans):
+    size = length(spans)
+    return spans / jnp.where(size > 0.0, size, 1.0)[:, None]
+
+
+def _rate(motion, points: Points) -> Float[Array, "n 3"]:
+    velocity = jnp.stack([motion.point_velocity(point) for point in points])
+    return velocity[1:] - velocity[:-1]
+
+
+def _pull(configuration, points: Points, tension) -> Load:
+    """What a rope does to its points."""
+    forces = tension * _directions(_spans(configuration, points))
+    total = Load.none(configuration.system)
+    for first, second, force in zip(points, points[1:], forces, strict=False):
+        total = total.plus(configuration.point_load(first, force)).plus(configuration.point_load(second, -force))
+    return total
+
+
+class Rope(AbstractConstraint):
+    """A rope, without mass and friction, that stays taut over points (small sheaves); or a strut between two.
+
+    `Rope("hoist", [winch, boom.at("tip"), hook], length=30.0)` keeps the way from point to point at that length.
+    Its reaction is the tension [N]; a negative one says that a rope would be slack, or a strut is pressed.
+    It carries no body: each body needs joints to ground besides.
+
+    **Arguments:**
+
+    - `name`: unique among joints and constraints.
+    - `points`: two or more bodies (their reference frames), `body.at(...)`, or `lx.GROUND.at(...)`, in order.
+    - `length`: [m], a number, or a function of time t [s], twice differentiable: a winch, or a driven cylinder. Numbers
+      of the function to be traced go in by `jax.tree_util.Partial(function, numbers)` or an `equinox.Module`.
+
+    **Raises:** `ValueError` for fewer than two points, all of them on one body, or a length that is not positive.
+    """
+
+    points: Points
+    length: Float[Array, ""] | Law
+
+    def __init__(self, name: str, points, length):
+        self.name = checked_name(name, "rope")
+        self.points = _points(points, f"rope {name!r}")
+        if callable(length):
+            self.length = Law(length, (), f"rope {name!r}: length [m]")
+            jax.eval_shape(self.length, jnp.zeros(()))
+        else:
+            self.length = positive(length, f"rope {name!r}: length [m]")
+
+    @property
+    def frames(self):
+        return self.points
+
+    @property
+    def is_driven(self):
+        return isinstance(self.length, Law)
+
+    def right_side(self, t):
+        return -evaluated(self.length, t)
+
+    def held(self, t):
+        return Rope(self.name, self.points, evaluated(self.length, t))
+
+    def value(self, configuration):
+        """Minus its length: rows are such that their multipliers are tensions."""
+        return -jnp.sum(length(_spans(configuration, self.points)))
+
+    def load(self, configuration, tension) -> Load:
+        """What it does to its points."""
+        return _pull(configuration, self.points, tension)
+
+    def bias(self, motion) -> Float[Array, ""]:
+        """The acceleration of its length that velocities alone cause [m/s²]."""
+        spans, rate = _spans(motion.configuration, self.points), _rate(motion, self.points)
+        points = jnp.stack([motion.point_bias(point) for point in self.points])
+        along, size = _directions(spans), length(spans)
+        turning = dot(rate, rate) - dot(along, rate) ** 2
+        return jnp.sum(dot(along, points[1:] - points[:-1]) + turning / jnp.where(size > 0.0, size, 1.0))
+
+
+class ElasticRope(AbstractForce):
+    """An elastic rope, without mass and friction, over points (small sheaves); slack where it is too long.
+
+    It pulls with `stiffness` [N/m] (E A over the free length) × stretch + `damping` [N s/m] × rate of stretch, and
+    never pushes.
+
+    **Arguments:** `points`: see `Rope`; `stiffness`; `free_length` [m]; `damping`.
+    """
+
+    points: Points
+    stiffness: Float[Array, ""]
+    free_length: Float[Array, ""]
+    damping: Float[Array, ""]
+
+    def __init__(self, points, stiffness, free_length, damping=0.0):
+        self.points = _points(points, "ElasticRope")
+        self.stiffness = positive(stiffness, f"{self.described}: stiffness [N/m]")
+        self.free_length = positive(free_length, f"{self.described}: free_length [m]")
+        what = f"{self.described}: damping [N s/m]"
+        self.damping = require(number(damping, (), what), lambda x: x >= 0.0, what, "it must be zero or more")
+
+    @property
+    def frames(self):
+        return self.points
+
+    def _stretch(self, configuration):
+        return jnp.sum(length(_spans(configuration, self.points))) - self.free_length
+
+    def load(self, t, motion):
+        configuration = motion.configuration
+        stretch = self._stretch(configuration)
+        along = _directions(_spans(configuration, self.points))
+        rate = jnp.sum(dot(along, _rate(motion, self.points)))
+        tension = jnp.maximum(self.stiffness * stretch + self.damping * rate, 0.0)
+        return _pull(configuration, self.points, jnp.where(stretch > 0.0, tension, 0.0))
+
+    def potential_energy(self, configuration):
+        return self.stiffness * jnp.maximum(self._stretch(configuration), 0.0) ** 2 / 2.0
