@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import linkax as lx
-from linkax.equations import coordinates, loops
+from linkax.equations import configuration, coordinates, loops
 from linkax.equations.coordinates import neutral
 from linkax.equations.system import system_of
+from linkax.model import ropes
 
 
 class PinInPlane(lx.Revolute):
@@ -67,21 +68,27 @@ class NotHereError(Exception):
     pass
 
 
-def test_quaternions_drives_and_combined_rows_are_traced_where_they_are(monkeypatch):
+def test_special_elements_are_traced_where_they_are(monkeypatch):
     def refuse(*arguments):
         raise NotHereError
 
-    for module, name in ((coordinates, "multiply"), (loops, "_right_sides"), (loops, "_combine")):
+    special = (coordinates, "multiply"), (loops, "_right_sides"), (loops, "_combine")
+    for module, name in (*special, (configuration, "_bent"), (ropes, "_spans")):
         monkeypatch.setattr(module, name, refuse)
     bar, hinge = lx.rod("bar", 1.0, 1.0), lx.Revolute("hinge", lx.GROUND, lx.rod("bar", 1.0, 1.0), "z")
     traced(four_bar(lx.Revolute))
+    beam = lx.Beam("beam", 1.0, lx.Section(1.0, 1.0), elements=1, bends="z", torsion=False, stretch=False)
     for joints, constraints in (
+        ([hinge, lx.Fixed("weld", bar, beam)], []),
+        ([hinge], [lx.Rope("rope", [lx.GROUND, bar.at("tip"), lx.GROUND.at([1.0, 0.0, 0.0])], 2.0)]),
         ([lx.Spherical("ball", lx.GROUND, bar), lx.Revolute("second", lx.GROUND, bar, "z", cut=True)], []),
         ([hinge], [lx.Drive("motor", "hinge", jnp.sin)]),
         ([hinge], [lx.Distance("rope", lx.GROUND.at([1.0, 0.0, 0.0]), bar.at("tip"), 1.0)]),
     ):
+        bodies = [bar, beam] if "weld" in [joint.name for joint in joints] else [bar]
+        mechanism = lx.Mechanism(bodies, joints, constraints=constraints)
         with pytest.raises(NotHereError):
-            traced(lx.Mechanism([bar], joints, constraints=constraints))
+            traced(mechanism)
 
 
 def test_mechanisms_that_share_only_ground_are_islands():

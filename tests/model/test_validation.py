@@ -12,6 +12,13 @@ def body(name="part", mass=1.0, inertia=(1.0, 1.0, 1.0), **options):
     return lx.RigidBody(name, mass, inertia=inertia, **options)
 
 
+STEEL = lx.Material(2.1e11, 0.3, 7850.0)
+
+
+def slender(**options):
+    return lx.Beam("boom", 1.0, lx.Section(1.0, 1.0), torsion=False, stretch=False, **options)
+
+
 BAD = {
     "negative mass": (lambda: body(mass=-2.0), ["'part'", "-2.0", "zero or more"]),
     "mass not a number": (lambda: body(mass=float("nan")), ["'part'", "nan", "finite"]),
@@ -55,6 +62,27 @@ BAD = {
     ),
     "screw without a pitch": (lambda: lx.Screw("nut", lx.GROUND, body(), "x", 0.0), ["'nut'", "0.0", "lx.Revolute"]),
     "distance of zero": (lambda: lx.Distance("rope", lx.GROUND, body(), 0.0), ["'rope'", "0.0", "lx.Spherical"]),
+    "section that resists nothing": (lambda: lx.Section(0.0, 1.0), ["bending_stiffness", "0.0", "positive"]),
+    "section of negative weight": (lambda: lx.Section(1.0, -1.0), ["linear_density", "-1.0", "positive"]),
+    "material that no solid is": (lambda: lx.Material(1e9, 0.7, 1.0), ["poissons_ratio", "0.7", "(-1, 0.5]"]),
+    "walls too thick": (lambda: lx.rectangle(0.1, 0.2, STEEL, 0.05), ["thickness", "0.05", "less than half"]),
+    "tube of walls alone": (lambda: lx.circle(0.1, STEEL, 0.06), ["thickness", "0.06", "less than half"]),
+    "beam of no section": (lambda: lx.Beam("boom", 1.0, 3.0), ["'boom'", "3.0", "lx.Section"]),
+    "beam of no length": (lambda: lx.Beam("boom", 0.0, lx.Section(1.0, 1.0)), ["'boom'", "0.0", "positive"]),
+    "beam of no elements": (lambda: slender(elements=0), ["'boom'", "0", "at least 1"]),
+    "beam that bends about x": (lambda: slender(bends="x"), ["'boom'", "'x'", "'yz'"]),
+    "beam that is rigid": (lambda: slender(bends=""), ["'boom'", "lx.rod"]),
+    "beam that twists without stiffness": (
+        lambda: lx.Beam("boom", 1.0, lx.Section(1.0, 1.0)),
+        ["'boom'", "torsional_stiffness", "leave that strain out"],
+    ),
+    "beam that twists without inertia": (
+        lambda: lx.Beam("boom", 1.0, lx.Section(1.0, 1.0, torsional_stiffness=1.0), stretch=False),
+        ["'boom'", "rotary_inertia", "axial_stiffness"],
+    ),
+    "beam with negative damping": (lambda: slender(damping=-1.0), ["'boom'", "damping", "-1.0"]),
+    "unknown place on a beam": (lambda: slender().at("middle"), ["'boom'", "'middle'", "'tip'"]),
+    "sleeve on a rigid body": (lambda: lx.Sliding("sleeve", body(), body("other")), ["'sleeve'", "lx.Beam"]),
     "coupling of nothing": (lambda: lx.Coupling("gears", {}), ["'gears'", "{}", "factor"]),
     "coupling by zero": (lambda: lx.Coupling("gears", {"pin": 0.0}), ["'gears'", "0.0", "not zero"]),
     "coupling of a number": (lambda: lx.Coupling("gears", {3: 1.0}), ["'gears'", "3", "name of a joint"]),
@@ -82,12 +110,20 @@ PIN = lx.Revolute("pin", lx.GROUND, LINK.at("base"), "z")
 KNEE = lx.Revolute("knee", LINK.at("tip"), OTHER.at("base"), "z")
 CUT_KNEE = lx.Revolute("knee", LINK.at("tip"), OTHER.at("base"), "z", cut=True)
 WELD = lx.Fixed("weld", lx.GROUND, OTHER)
+BOOM = slender()
 SPREAD = {
     "two bodies of one name": ([LINK, LINK], [PIN], [], ["'link'", "2 times", "of its own"]),
     "two joints of one name": ([LINK], [PIN, PIN], [], ["'pin'", "2 times", "of its own"]),
     "joint to a body that is not there": ([LINK], [PIN, KNEE], [], ["'knee'", "'other'", "add it"]),
     "body that hangs on nothing": ([LINK, OTHER], [PIN], [], ["'other'", "ground", "join"]),
     "cut joint that closes no loop": ([LINK, OTHER], [PIN, CUT_KNEE], [], ["'knee'", "cut=True", "remove"]),
+    "beam that hangs on nothing": ([LINK, BOOM], [PIN], [], ["connects 'boom' to ground", "join"]),
+    "two sleeves on one body": (
+        [LINK, OTHER, BOOM],
+        [PIN, lx.Fixed("foot", LINK, BOOM), *(lx.Sliding(name, BOOM, OTHER) for name in ("sleeve", "shoe"))],
+        [],
+        ["'shoe'", "slides along a beam", "massless body"],
+    ),
     "no body": ([LINK, "other"], [PIN], [], ["bodies", "'other'", "RigidBody"]),
     "torque on an unknown joint": ([LINK], [PIN], [lx.JointTorque("nip", 1.0)], ["'nip'", "JointTorque", "'pin'"]),
     "torque on a weld": ([OTHER], [WELD], [lx.JointTorque("weld", 1.0)], ["'weld'", "0 speeds", "not one"]),

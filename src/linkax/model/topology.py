@@ -295,7 +295,7 @@ def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: list[se
             raise ValueError(f"joint {joint.name!r}: cut=True, but it closes no loop; remove cut=True")
     loose = [name for name in bodies if find(name) != find(GROUND_NAME)]
     if loose:
-        names = ", ".join(map(repr, loose))
+        names = ", ".join(map(repr, dict.fromkeys(name.partition("[")[0] for name in loose)))  # beams once
         raise ValueError(f"no joint connects {names} to ground; join each to lx.GROUND or to a body that is joined")
     order, carriers, predecessors = _from_ground(tree)
     in_tree = {joint.name for joint in carriers}
