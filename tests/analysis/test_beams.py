@@ -1,5 +1,6 @@
 """Beams at rest and vibrating, against beam theory."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -93,6 +94,7 @@ def test_frequencies_of_a_cantilever():
     np.testing.assert_allclose(frequencies(cantilever(tip_mass=1.0), 3), exact, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_frequencies_of_a_free_beam():
     beam = lx.Beam("beam", 1.0, lx.Section(1.0, 1.0), **PLANAR)
     free = lx.Mechanism([beam], [lx.Planar("afloat", lx.GROUND, beam, axis="z")])
@@ -166,3 +168,28 @@ def test_errors_fall_with_the_fourth_power_of_the_elements():
     exact, counts = elastica(4.0), [2, 4, 8]
     errors = [np.linalg.norm(tip(cantilever((0.0, 4.0, 0.0), elements=count))[:2] - exact) for count in counts]
     assert np.all(np.diff(np.log2(errors)) < -3.4)
+
+
+@pytest.mark.slow
+def test_derivatives_of_deflection_and_frequency():
+    """Of a loaded cantilever, by the height of its profile, its modulus and its load."""
+
+    def found(height, modulus, load):
+        section = lx.rectangle(0.05, height, lx.Material(modulus, 0.3, 2700.0), 0.004)
+        beam, weight = (
+            lx.Beam("beam", 2.0, section, elements=2, bends="y", torsion=False),
+            lx.point_mass("weight", load),
+        )
+        joints = [lx.Fixed("clamp", lx.GROUND, beam), lx.Fixed("hook", beam.at("tip"), weight)]
+        mechanism = lx.Mechanism([beam, weight], joints, [lx.Gravity([0.0, 0.0, -9.81])])
+        rest = lx.equilibrium(mechanism, lx.State(jnp.zeros(6), jnp.zeros(6)))
+        deflection = lx.Solution.of_state(mechanism, rest).position("beam", at="tip")[0, 2]
+        frequency = lx.linearise(mechanism, rest, degrees_of_freedom=6).natural_frequencies[0]
+        return jnp.stack([deflection, frequency])
+
+    at, found = np.array([0.06, 7e10, 30.0]), jax.jit(found)
+    slopes = np.stack(jax.jit(jax.jacfwd(found, (0, 1, 2)))(*at), axis=1)
+    for index, value in enumerate(at):
+        step = np.eye(3)[index] * value * 1e-4
+        differences = (found(*(at + step)) - found(*(at - step))) / (2e-4 * value)
+        np.testing.assert_allclose(slopes[:, index], differences, rtol=1e-5)

@@ -224,7 +224,7 @@ def test_second_derivatives_forwards():
 slowly = lambda *modes: pytest.param(modes, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("modes", [(jax.jacrev,), slowly(jax.jacfwd), slowly(jax.jacfwd, jax.jacfwd)])
+@pytest.mark.parametrize("modes", [slowly(jax.jacrev), slowly(jax.jacfwd), slowly(jax.jacfwd, jax.jacfwd)])
 def test_times_of_a_driven_joint(modes):
     """By the end of the run and by times at which it is saved, with rows that depend on time."""
     arm = lx.rod("arm", 1.0, 1.0)
@@ -286,6 +286,7 @@ def test_masses_through_three_passages():
         np.testing.assert_allclose(found[masses], jax.jacfwd(reduced)(values), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_masses_alone_from_a_state_that_is_given():
     """Only the forces depend on the numbers: right-hand sides of corrections have no derivative."""
 

@@ -56,7 +56,8 @@ def test_every_joint_type_passes_singular_configurations(name):
     assert found.closest < 0.05
 
 
-@pytest.mark.parametrize("carrier", [pytest.param(lx.Planar, marks=pytest.mark.slow), lx.Free])
+@pytest.mark.slow
+@pytest.mark.parametrize("carrier", [lx.Planar, lx.Free])
 def test_two_loops_that_share_a_coupler_are_singular_at_once(carrier):
     """The coupler is carried from ground, and both its pins are cut."""
     along = np.array([1.0, 0.0, 0.0])

@@ -42,7 +42,7 @@ def test_tighter_tolerances_are_never_worse(solver, name):
         assert steps[3] <= 3 * steps[2]
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 2, pytest.param(5, marks=pytest.mark.slow)])
 def test_row_of_four_bars_stays_on_its_branch(count):
     found = lx.simulate(*start("n-four-bar", "A02", {"N": count}), t1=10.0, accuracy=lx.PRECISE)
     error = found.position("link_0", at="tip")[-1, :2] - n_four_bar(10.0, count)

@@ -64,7 +64,8 @@ def anywhere():
     return FreeCrankSlider(generator.uniform(0.0, np.pi / 2, MEMBERS), np.ones(MEMBERS))
 
 
-@pytest.mark.parametrize("starts", [next_to_the_singular_configuration, pytest.param(anywhere, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("starts", [next_to_the_singular_configuration, anywhere])
 def test_errors_of_many_starts_lie_on_one_curve(starts):
     starts = starts()
     exact = starts.exact()

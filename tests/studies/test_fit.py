@@ -177,6 +177,7 @@ def test_bad_input():
         lx.fit(lambda p: p["a"] ** 2, {"a": 1.0}, optimiser=optx.LevenbergMarquardt(1e-6, 1e-6))
 
 
+@pytest.mark.slow
 def test_experiments_with_their_own_initial_states():
     """A pendulum's length and damping from three swings, the angles at which they began unknown."""
     hinge = lambda arm: lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
