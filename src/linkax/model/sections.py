@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import number, require
+from linkax.model.numbers import known, number, require
 
 
 def positive(entry, what):
@@ -126,7 +126,9 @@ def _of_profile(material, area, second_moments, torsion_constant, shear_coeffici
     )
 
 
-def _wall(thickness, most, what):
+def _wall(thickness, sizes, what):
+    """The thickness of walls that fit into a profile of these sizes, where they are known."""
+    most = min((float(known(size)) for size in sizes if known(size) is not None), default=np.inf) / 2.0
     remedy = f"it must be positive, and less than half of the profile, {most}"
     return require(number(thickness, (), what), lambda metres: 0.0 < metres < most, what, remedy)
 
@@ -149,8 +151,7 @@ def rectangle(width, height, material: Material, thickness=None) -> Section:
         shear = 10.0 * (1.0 + ratio) / (12.0 + 11.0 * ratio)
         second_moments = width * height**3 / 12.0, height * width**3 / 12.0
         return _of_profile(material, width * height, second_moments, torsion, (shear, shear))
-    most = np.minimum(width, height) / 2 if isinstance(width, np.ndarray) else jnp.inf
-    thickness = _wall(thickness, most, "rectangle: thickness [m]")
+    thickness = _wall(thickness, (width, height), "rectangle: thickness [m]")
     inner_width, inner_height = width - 2.0 * thickness, height - 2.0 * thickness
     second_moments = (
         (width * height**3 - inner_width * inner_height**3) / 12.0,
@@ -182,8 +183,7 @@ def circle(diameter, material: Material, thickness=None) -> Section:
     diameter = positive(diameter, "circle: diameter [m]")
     inner = 0.0 * diameter
     if thickness is not None:
-        most = diameter / 2 if isinstance(diameter, np.ndarray) else jnp.inf
-        inner = diameter - 2.0 * _wall(thickness, most, "circle: thickness [m]")
+        inner = diameter - 2.0 * _wall(thickness, (diameter,), "circle: thickness [m]")
     second_moment = math.pi / 64.0 * (diameter**4 - inner**4)
     ratio, hollow = material.poissons_ratio, (inner / diameter) ** 2
     squared = (1.0 + hollow) ** 2
