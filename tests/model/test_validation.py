@@ -15,8 +15,9 @@ def body(name="part", mass=1.0, inertia=(1.0, 1.0, 1.0), **options):
 STEEL = lx.Material(2.1e11, 0.3, 7850.0)
 
 
-def slender(**options):
-    return lx.Beam("boom", 1.0, lx.Section(1.0, 1.0), torsion=False, stretch=False, **options)
+def slender(section=None, **options):
+    section = lx.Section(1.0, 1.0) if section is None else section
+    return lx.Beam("boom", 1.0, section, torsion=False, stretch=False, **options)
 
 
 BAD = {
@@ -78,6 +79,10 @@ BAD = {
     ),
     "beam that twists without inertia": (
         lambda: lx.Beam("boom", 1.0, lx.Section(1.0, 1.0, torsional_stiffness=1.0), stretch=False),
+        ["'boom'", "rotary_inertia", "axial_stiffness"],
+    ),
+    "beam that shears without inertia": (
+        lambda: slender(section=lx.Section(1.0, 1.0, shear_stiffness=1.0), shear=True),
         ["'boom'", "rotary_inertia", "axial_stiffness"],
     ),
     "beam with negative damping": (lambda: slender(damping=-1.0), ["'boom'", "damping", "-1.0"]),

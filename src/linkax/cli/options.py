@@ -12,8 +12,8 @@ from linkax.scenes import scene
 from linkax.simulation.runge_kutta import RungeKutta4
 
 PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
-EXPLICIT, IMPLICIT = ("Tsit5", "Dopri5", "Dopri8"), ("Kvaerno3", "Kvaerno5")
-SOLVERS = {name.lower(): getattr(diffrax, name) for name in (*EXPLICIT, *IMPLICIT)} | {"rk4": RungeKutta4}
+OF_DIFFRAX = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno5")
+SOLVERS = {name.lower(): getattr(diffrax, name) for name in OF_DIFFRAX} | {"rk4": RungeKutta4}
 
 
 def add_run_options(parser):

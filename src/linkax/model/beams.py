@@ -24,14 +24,8 @@ from linkax.model.numbers import number, require, rotation_matrix
 from linkax.model.sections import Section, positive
 from linkax.model.terms import Term
 
-TWIST, BENDING_Y, BENDING_Z, STRETCH, SHEAR_Y, SHEAR_Z = range(6)
-STRAIN_NAMES = (
-    "torsional_stiffness",
-    "bending_stiffness",
-    "bending_stiffness",
-    "axial_stiffness",
-    *2 * ("shear_stiffness",),
-)
+# What a section needs against each component of strain.
+STIFFNESSES = ("torsional_stiffness", *2 * ("bending_stiffness",), "axial_stiffness", *2 * ("shear_stiffness",))
 
 
 class Beam(AbstractBody):
@@ -90,11 +84,9 @@ class Beam(AbstractBody):
             raise ValueError(f"{what} neither bends, twists nor stretches; use lx.rod")
         for strain in self.strains:
             if section.stiffness(strain) is None:
-                raise ValueError(
-                    f"{what}: its section has no {STRAIN_NAMES[strain]}; give it, or leave that strain out"
-                )
-        if torsion:
-            remedy = f"a beam that twists needs some; give it or axial_stiffness, or torsion=False ({what})"
+                raise ValueError(f"{what}: its section has no {STIFFNESSES[strain]}; give it, or leave that strain out")
+        if torsion or shear:
+            remedy = f"{what} twists or shears, which turns sections and takes some; give it, or axial_stiffness"
             require(section.rotary_inertia, np.any, "section: rotary_inertia [kg m]", remedy)
         seconds = f"{what}: damping [s]"
         self.damping = require(number(damping, (), seconds), lambda x: x >= 0.0, seconds, "it must be zero or more")
@@ -121,6 +113,11 @@ class Beam(AbstractBody):
         return Frame(self.name, number(where, (3,), what), axes)
 
     @property
+    def element_length(self) -> Float[Array, ""]:
+        """[m]."""
+        return self.length / self.elements
+
+    @property
     def sections(self) -> tuple[str, ...]:
         """Names of its sections: nodes, and where it has its mass between them, counted in elements from the base."""
         places = np.add.outer(np.arange(self.elements), STATIONS[:-1]).reshape(-1)
@@ -128,7 +125,7 @@ class Beam(AbstractBody):
 
     def section_at(self, coordinates, place) -> Float[Array, "4 4"]:
         """The section at a place [m] on the axis, seen from the base, see `linkax.spatial.screws`."""
-        return AlongBeam(self.strains, slides=False)(coordinates, (self.length / self.elements, place))
+        return AlongBeam(self.strains, slides=False)(coordinates, (self.element_length, place))
 
     def strain(self, coordinates) -> Float[Array, "... n 6"]:
         """Strains at the nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
@@ -141,7 +138,7 @@ class Beam(AbstractBody):
         density, (about_y, about_z) = self.section.linear_density, self.section.rotary_inertia
         inertia = jnp.stack([about_y + about_z, about_y, about_z])
         part = len(STATIONS) - 1
-        shares = np.where(np.arange(len(self.sections)) % part == 0, 0.0, 0.5) * self.length / self.elements
+        shares = np.where(np.arange(len(self.sections)) % part == 0, 0.0, 0.5) * self.element_length
         return [
             RigidBody(name, share * density, inertia=share * inertia)
             for name, share in zip(self.sections, shares, strict=True)
@@ -158,7 +155,7 @@ class Beam(AbstractBody):
                 beam=self.name,
                 strains=self.strains,
                 elements=self.elements,
-                length=self.length / self.elements,
+                length=self.element_length,
                 element=element,
                 begin=float(STATIONS[part]),
                 end=float(STATIONS[part + 1]),
@@ -171,13 +168,13 @@ class Beam(AbstractBody):
         body = RigidBody(name, 0.0)
         joint = BeamStation(
             name,
-            self.reference,
-            body.reference,
-            self.name,
-            self.strains,
-            self.elements,
-            self.length / self.elements,
-            place,
+            parent=self.reference,
+            child=body.reference,
+            beam=self.name,
+            strains=self.strains,
+            elements=self.elements,
+            length=self.element_length,
+            place=place,
         )
         return body, joint
 
@@ -196,7 +193,7 @@ class BeamElasticity(AbstractForce):
     def __init__(self, beam: Beam):
         self.beam, self.elements = beam.name, beam.elements
         self.stiffness = jnp.stack([jnp.asarray(beam.section.stiffness(strain)) for strain in beam.strains])
-        self.stiffness = self.stiffness * beam.elements / beam.length
+        self.stiffness = self.stiffness / beam.element_length
         self.damping = beam.damping
 
     @property

@@ -8,35 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.bodies import Frame
+from linkax.model.elements import AbstractElement
 from linkax.model.functions import Law
 from linkax.model.numbers import known, number
 from linkax.model.terms import Term, term
 
 
-class AbstractConstraint(eqx.Module):
+class AbstractConstraint(AbstractElement):
     """One equation: what is constrained = right side. Its multiplier is `Solution.reaction` of its name."""
 
     name: str = eqx.field(static=True)
 
     @property
-    def terms(self) -> tuple[Term, ...]:
-        """Whose coordinates it relates, which go into the spanning tree."""
-        return ()
-
-    @property
-    def frames(self) -> tuple[Frame, ...]:
-        """Frames that it attaches to."""
-        return ()
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """The joints of `terms`."""
-        return tuple(dict.fromkeys(joint for joint, _ in self.terms))
-
-    @property
-    def described(self) -> str:
-        """What errors call it."""
+    def described(self):
         return f"{type(self).__name__.lower()} {self.name!r}"
 
     @property

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from linkax.model.bodies import Frame, frame_of
+from linkax.model.elements import AbstractElement
 from linkax.model.functions import Law, evaluated, number_or_law
 from linkax.model.numbers import number, require
 from linkax.model.terms import Term, term
@@ -36,7 +37,7 @@ class Load(NamedTuple):
         return Load(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-class AbstractForce(eqx.Module):
+class AbstractForce(AbstractElement):
     """A force element; a user's own is a subclass with a `load`.
 
     `motion` is a `linkax.Motion`: where all bodies are and how they move at one instant, and how
@@ -45,28 +46,12 @@ class AbstractForce(eqx.Module):
     """
 
     @property
-    def terms(self) -> tuple[Term, ...]:
-        """Joints that this element acts along; they go into the spanning tree where they can."""
-        return ()
-
-    @property
-    def frames(self) -> tuple[Frame, ...]:
-        """Frames that this element attaches to."""
-        return ()
-
-    @property
     def needs_coordinate(self) -> bool:
         """Whether it reads the coordinates of its joints, and not their speeds alone."""
         return False
 
     @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints of `terms`."""
-        return tuple(dict.fromkeys(along.joint for along in self.terms))
-
-    @property
-    def described(self) -> str:
-        """What errors call it."""
+    def described(self):
         return _described(type(self).__name__, [repr(name) for name in self.joints] or _named(self.frames))
 
     @abc.abstractmethod

@@ -51,10 +51,8 @@ class Mechanism(eqx.Module):
         joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
         constraints = [c for c in constraints if not isinstance(c, Distance)]
         bodies = _checked(bodies, (RigidBody, Beam), "bodies", "RigidBody or Beam")
-        joints, forces = (
-            _checked(joints, AbstractJoint, "joints", "Joint"),
-            _checked(forces, AbstractForce, "forces", "Force"),
-        )
+        joints = _checked(joints, AbstractJoint, "joints", "Joint")
+        forces = _checked(forces, AbstractForce, "forces", "Force")
         beams = [body for body in bodies if isinstance(body, Beam)]
         bodies, joints, forces, constraints = taken_apart(bodies, joints, forces, constraints)
         by_name, joint_by_name = _by_name(bodies, "body"), _by_name(joints, "joint")
@@ -62,9 +60,8 @@ class Mechanism(eqx.Module):
         _check_references(by_name, joint_by_name, constraints, forces)
         related = {name for constraint in constraints for name in constraint.joints}
         acted_on = {name for force in forces for name in force.joints}
-        order, carriers, predecessors, cuts = spanning_tree(
-            list(by_name), joints, [*held_first(joints), related, acted_on]
-        )
+        first = [*held_first(joints), related, acted_on]
+        order, carriers, predecessors, cuts = spanning_tree(list(by_name), joints, first)
         for joint in cuts:
             if isinstance(joint, Sliding):
                 raise ValueError(

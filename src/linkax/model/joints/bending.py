@@ -210,7 +210,7 @@ class Sliding(OnBeam):
     def __init__(self, name: str, beam, child):
         if not hasattr(beam, "elements"):
             raise ValueError(f"joint {name!r}: beam is {beam!r}; give a lx.Beam, and any body as child")
-        super().__init__(name, beam, child, beam.name, beam.strains, beam.elements, beam.length / beam.elements)
+        super().__init__(name, beam, child, beam.name, beam.strains, beam.elements, beam.element_length)
 
     @property
     def kind(self):

@@ -1,0 +1,32 @@
+"""What forces and constraints have in common: joints that they act along, frames that they attach to."""
+
+import abc
+
+import equinox as eqx
+
+from linkax.model.bodies import Frame
+from linkax.model.terms import Term
+
+
+class AbstractElement(eqx.Module):
+    """A force element or a constraint."""
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Speeds of joints that this element acts along; those joints go into the spanning tree where they can."""
+        return ()
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """Frames that this element attaches to."""
+        return ()
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints of `terms`."""
+        return tuple(dict.fromkeys(along.joint for along in self.terms))
+
+    @property
+    @abc.abstractmethod
+    def described(self) -> str:
+        """What errors call it."""
