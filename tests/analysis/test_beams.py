@@ -62,7 +62,7 @@ def test_elastica(load):
     exact = elastica(load)
     if load == 10.0:
         np.testing.assert_allclose(exact, [1.0 - 0.55500, 0.81061], atol=5e-6)
-    np.testing.assert_allclose(tip(cantilever((0.0, load, 0.0)))[:2], exact, atol=5e-6)
+    np.testing.assert_allclose(tip(cantilever((0.0, load, 0.0)))[:2], exact, atol=3e-7)
 
 
 def test_rolled_up_by_a_moment():
@@ -76,7 +76,7 @@ def test_rolled_up_by_a_moment():
     )
     np.testing.assert_allclose(found.strain("beam")[0, :, 2], 2.0 * np.pi, rtol=1e-9)
     # The clamp, and any section, carries the moment alone.
-    for joint in ("clamp", "beam", "beam[6.79]"):
+    for joint in ("clamp", "beam", "beam[7]"):
         np.testing.assert_allclose(found.reaction(joint, on="parent").moment[0], [0.0, 0.0, 2.0 * np.pi], atol=1e-8)
 
 

@@ -87,6 +87,11 @@ BAD = {
     ),
     "beam with negative damping": (lambda: slender(damping=-1.0), ["'boom'", "damping", "-1.0"]),
     "unknown place on a beam": (lambda: slender().at("middle"), ["'boom'", "'middle'", "'tip'"]),
+    "place of unknown distance": (
+        lambda: jax.jit(lambda x: slender().at(x).offset)(0.5),
+        ["'boom'", "traced", "element="],
+    ),
+    "place in an unknown element": (lambda: slender().at(0.5, element=8), ["'boom'", "8", "0 to 7"]),
     "sleeve on a rigid body": (lambda: lx.Sliding("sleeve", body(), body("other")), ["'sleeve'", "lx.Beam"]),
     "coupling of nothing": (lambda: lx.Coupling("gears", {}), ["'gears'", "{}", "factor"]),
     "coupling by zero": (lambda: lx.Coupling("gears", {"pin": 0.0}), ["'gears'", "0.0", "not zero"]),

@@ -5,6 +5,8 @@ topology's `path`; only orientations need products along the way (by pointer dou
 Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 4, gives the recursions.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,8 @@ from linkax.equations.system import System
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.forces import Load
+from linkax.model.joints.bending import section_at
+from linkax.model.joints.joint import Motion
 from linkax.model.numbers import value
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
@@ -203,10 +207,12 @@ def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " 
 
 def beam_point(configuration: Configuration, beam: Beam, point) -> Float[Array, "3"]:
     """A point (3,) fixed to the section of a beam at point[0], in the world [m]."""
-    base, coordinates = configuration.body(beam.sections[0]), configuration.joint_coordinates(beam.name)
-    section = beam.section_at(coordinates, point[0])
+    nodes = np.array([configuration.body(name) for name in beam.nodes])
+    coordinates = configuration.joint_coordinates(beam.name)
+    section, element = section_at(coordinates, beam.strains, beam.element_length, point[0])
     seen = section[:3, 3] + section[:3, 1:3] @ point[1:]
-    return configuration.world_position()[base] + configuration.rotation[base] @ seen
+    node = jnp.asarray(nodes)[element]
+    return configuration.world_position()[node] + configuration.rotation[node] @ seen
 
 
 def bodies_of_cuts(topology):
@@ -268,24 +274,50 @@ def _joint_motions(system, q):
     angular = jnp.asarray(_constant_subspace(topology, "angular_subspace"), q.dtype)
     linear = _linear_subspace(system)
     shift = by_body(system, linear * of_motions(topology, by_speed(topology, q))[:, None])
-    for kind, numbers in zip(topology.kinds, system.numbers, strict=True):
-        if numbers is not None:
-            turn, away, *subspace = jax.vmap(_bent, (None, 0, 0))(kind.motion, q[kind.places], numbers)
-            motions = _motions_of(topology, kind)
-            angular, linear = (
-                whole.at[motions].set(part.reshape(-1, 3))
-                for whole, part in zip((angular, linear), subspace, strict=True)
-            )
-            shift = shift.at[np.array(kind.bodies)].set(away)
-        else:
-            turn = jax.vmap(kind.motion.rotation)(q[kind.places])
-            if kind.motion.angular_subspace_at is not None:
-                turned = jax.vmap(kind.motion.angular_subspace_at)(q[kind.places])
-                angular = angular.at[_motions_of(topology, kind)].set(turned.reshape(-1, 3))
+    for kind in topology.kinds:
+        if isinstance(kind.motion, Motion):
+            continue
+        turn = jax.vmap(kind.motion.rotation)(q[kind.places])
+        if kind.motion.angular_subspace_at is not None:
+            turned = jax.vmap(kind.motion.angular_subspace_at)(q[kind.places])
+            angular = angular.at[_motions_of(topology, kind)].set(turned.reshape(-1, 3))
+        turns.append(turn)
+        order += kind.bodies
+    for kind, (turn, away, *subspace) in over_bending(_bent, system, lambda kind: (q[kind.places],)):
+        motions, count = _motions_of(topology, kind), kind.places.shape[1]
+        angular, linear = (
+            whole.at[motions].set(part[:, :count].reshape(-1, 3))
+            for whole, part in zip((angular, linear), subspace, strict=True)
+        )
+        shift = shift.at[np.array(kind.bodies)].set(away)
         turns.append(turn)
         order += kind.bodies
     turn = turns[0] if len(turns) == 1 else jnp.concatenate(turns)[np.argsort(order)]
     return turn, shift, angular, linear
+
+
+def over_bending(function, system, read):
+    """A function of a `Motion`, arrays (k,) and numbers, over all joints that have one, by kind; traced once for each.
+
+    `read`: the arrays of a kind, (n, k) each.
+    """
+    alike = {}
+    for kind, numbers in zip(system.topology.kinds, system.numbers, strict=True):
+        if numbers is not None:
+            alike.setdefault(kind.motion, []).append((kind, numbers))
+    for motion, members in alike.items():
+        most = max(kind.places.shape[1] for kind, _ in members)
+        arrays = [
+            (*(jnp.pad(array, ((0, 0), (0, most - array.shape[1]))) for array in read(kind)), numbers)
+            for kind, numbers in members
+        ]
+        together = (array[0] if len(members) == 1 else jnp.concatenate(array) for array in zip(*arrays, strict=True))
+        found = jax.vmap(partial(function, motion))(*together)
+        first = 0
+        for kind, _ in members:
+            own = slice(first, first + len(kind.bodies))
+            yield kind, tuple(part[own] for part in found)
+            first = own.stop
 
 
 def _motions_of(topology, kind):

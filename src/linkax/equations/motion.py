@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, along_path, by_body, of_motions
+from linkax.equations.configuration import Configuration, along_path, by_body, of_motions, over_bending
 from linkax.equations.system import System
 from linkax.model.bodies import Frame
 from linkax.model.forces import Load
@@ -149,18 +149,13 @@ def _subspace_bias(configuration, v):
     """
     system, topology = configuration.system, configuration.system.topology
     angular, linear = {}, {}
-    for kind, numbers in zip(topology.kinds, system.numbers, strict=True):
-        members = np.array(kind.bodies)
-        coordinates = configuration.q[kind.places]
-        speeds = v[np.stack([topology.columns(body) for body in kind.bodies])]
-        if numbers is not None:
-            bent = jax.vmap(_bending, (None, 0, 0, 0))(kind.motion, coordinates, speeds, numbers)
-        elif kind.motion.angular_subspace_at is not None:
-            bent = (jax.vmap(partial(_turning, kind.motion))(coordinates, speeds),)
-        else:
-            continue
-        for found, part in zip((angular, linear), bent, strict=False):
-            found[kind.bodies] = rotate(configuration.joint_axes[members], part)
+    speeds = lambda kind: v[np.stack([topology.columns(body) for body in kind.bodies])]
+    read = lambda kind: (configuration.q[kind.places], speeds(kind))
+    turning = [kind for kind in topology.kinds if getattr(kind.motion, "angular_subspace_at", None) is not None]
+    found = [(kind, (jax.vmap(partial(_turning, kind.motion))(*read(kind)),)) for kind in turning]
+    for kind, accelerations in (*found, *over_bending(_bending, system, read)):
+        for parts, part in zip((angular, linear), accelerations, strict=False):
+            parts[kind.bodies] = rotate(configuration.joint_axes[np.array(kind.bodies)], part)
     return _scattered(topology, angular), _scattered(topology, linear)
 
 

@@ -4,7 +4,7 @@ Strains of the axis are the coordinates, linear between nodes: the beam is geome
 elastic forces are linear in its coordinates, and a slender one neither shears nor stretches unless it
 is asked to. (Of the alternatives, nodes with absolute coordinates or corotated elements need
 constraints to join a tree of relative coordinates, and rigid segments with springs converge with the
-second order only, where strains that are linear between nodes converge with the fourth.)
+second order only, where strains that are linear between nodes converge with the sixth.)
 """
 
 from typing import NamedTuple
@@ -18,14 +18,20 @@ from jaxtyping import Array, Float
 from linkax.model.bodies import AbstractBody, Frame, RigidBody, body_name
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce, Load
-from linkax.model.joints.bending import NUM_STRAINS, STATIONS, AlongBeam, BeamSegment, BeamStation, OnBeam
+from linkax.model.joints.bending import MASS_PLACES, NUM_STRAINS, BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.joint import AbstractJoint
-from linkax.model.numbers import number, require, rotation_matrix
+from linkax.model.numbers import known, number, require, rotation_matrix
 from linkax.model.sections import Section, positive
 from linkax.model.terms import Term
 
 # What a section needs against each component of strain.
 STIFFNESSES = ("torsional_stiffness", *2 * ("bending_stiffness",), "axial_stiffness", *2 * ("shear_stiffness",))
+
+
+class Place(Frame):
+    """A frame on a section of a beam, whose name is `body`, at offset[0] [m]; the section is in that element."""
+
+    element: int = eqx.field(static=True)
 
 
 class Beam(AbstractBody):
@@ -41,7 +47,7 @@ class Beam(AbstractBody):
 
     - `name`: unique in the mechanism, among joints too.
     - `length` [m]; `section`: a `Section`.
-    - `elements`: number of elements. Errors fall with its fourth power.
+    - `elements`: number of elements. Errors of deflections fall with its sixth power, of frequencies with its fourth.
     - `bends`: axes about which it bends, "yz" (default), "y", "z" or "".
     - `torsion`, `stretch`: whether it twists and stretches. Without, it is rigid against that, and motion
       has no fast waves.
@@ -95,22 +101,28 @@ class Beam(AbstractBody):
     def reference(self):
         return self.at("base")
 
-    def at(self, where, rotation=None) -> Frame:
+    def at(self, where, rotation=None, *, element=None) -> Frame:
         """A frame on this beam, with axes `rotation` in those of its section.
 
         `where`: "base", "tip", a distance [m] from the base along the axis, or [x, y, z] off the axis.
+        `element`: in which element that is, counted from 0; needed where JAX traces the distance or the length.
         """
         axes = rotation_matrix(rotation, f"rotation of a frame on beam {self.name!r}")
         if isinstance(where, str):
-            ends = {"base": self.sections[0], "tip": self.sections[-1]}
+            ends = {"base": self.nodes[0], "tip": self.nodes[-1]}
             if where not in ends:
                 raise ValueError(f"beam {self.name!r} has no frame {where!r}; give 'base', 'tip', or a distance [m]")
             return Frame(ends[where], np.zeros(3), axes)
         what = f"place of a frame on beam {self.name!r} [m]"
-        if np.ndim(where) == 0:
-            along = number(where, (), what)
-            return Frame(self.name, along * np.eye(3)[0], axes)
-        return Frame(self.name, number(where, (3,), what), axes)
+        offset = number(where, (), what) * np.eye(3)[0] if np.ndim(where) == 0 else number(where, (3,), what)
+        if element is None:
+            along = known(offset[0] / self.element_length)
+            if along is None:
+                raise ValueError(f"{what} is traced by JAX; say which element it is in: beam.at(..., element=0)")
+            element = int(np.clip(np.floor(along), 0, self.elements - 1))
+        elif element not in range(self.elements):
+            raise ValueError(f"{what}: element is {element!r}; give an integer from 0 to {self.elements - 1}")
+        return Place(self.name, offset, axes, element)
 
     @property
     def element_length(self) -> Float[Array, ""]:
@@ -118,14 +130,18 @@ class Beam(AbstractBody):
         return self.length / self.elements
 
     @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the sections at its nodes, from the base to the tip."""
+        return tuple(self._section(node) for node in range(self.elements + 1))
+
+    @property
     def sections(self) -> tuple[str, ...]:
         """Names of its sections: nodes, and where it has its mass between them, counted in elements from the base."""
-        places = np.add.outer(np.arange(self.elements), STATIONS[:-1]).reshape(-1)
-        return tuple(f"{self.name}[{np.round(place, 2):g}]" for place in (*places, self.elements))
+        places = np.add.outer(np.arange(self.elements), [0.0, *MASS_PLACES]).reshape(-1)
+        return tuple(self._section(place) for place in (*places, self.elements))
 
-    def section_at(self, coordinates, place) -> Float[Array, "4 4"]:
-        """The section at a place [m] on the axis, seen from the base, see `linkax.spatial.screws`."""
-        return AlongBeam(self.strains, slides=False)(coordinates, (self.element_length, place))
+    def _section(self, place):
+        return f"{self.name}[{np.round(place, 2):g}]"
 
     def strain(self, coordinates) -> Float[Array, "... n 6"]:
         """Strains at the nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
@@ -136,47 +152,41 @@ class Beam(AbstractBody):
 
     def _bodies(self):
         density, (about_y, about_z) = self.section.linear_density, self.section.rotary_inertia
-        inertia = jnp.stack([about_y + about_z, about_y, about_z])
-        part = len(STATIONS) - 1
-        shares = np.where(np.arange(len(self.sections)) % part == 0, 0.0, 0.5) * self.element_length
-        return [
-            RigidBody(name, share * density, inertia=share * inertia)
-            for name, share in zip(self.sections, shares, strict=True)
-        ]
+        inertia, share = jnp.stack([about_y + about_z, about_y, about_z]), self.element_length / len(MASS_PLACES)
+        empty = {name: RigidBody(name, 0.0) for name in self.nodes}
+        full = lambda name: RigidBody(name, share * density, inertia=share * inertia)
+        return [empty[name] if name in empty else full(name) for name in self.sections]
+
+    def _segment(self, name, child, element, place):
+        return BeamSegment(name, _reference(self.nodes[element]), child, self, element, place)
 
     def _joints(self):
-        parts = [divmod(index, len(STATIONS) - 1) for index in range(len(self.sections) - 1)]
-        on = lambda section: Frame(section, np.zeros(3), rotation_matrix(None, section))
-        return [
-            BeamSegment(
-                name=self.name if index == 0 else self.sections[index + 1],
-                parent=on(self.sections[index]),
-                child=on(self.sections[index + 1]),
-                beam=self.name,
-                strains=self.strains,
-                elements=self.elements,
-                length=self.element_length,
-                element=element,
-                begin=float(STATIONS[part]),
-                end=float(STATIONS[part + 1]),
-            )
-            for index, (element, part) in enumerate(parts)
-        ]
+        joints = []
+        for element, far in enumerate(self.nodes[1:]):
+            to_node = self._segment(self.name if element == 0 else far, _reference(far), element, 1.0)
+            between = [(self._section(element + place), float(place)) for place in MASS_PLACES]
+            joints += [to_node, *(self._segment(name, _reference(name), element, place) for name, place in between)]
+        return joints
 
     def _station(self, name, place):
         """A massless body at a place on the axis, and the joint that holds it there."""
-        body = RigidBody(name, 0.0)
-        joint = BeamStation(
-            name,
-            parent=self.reference,
-            child=body.reference,
-            beam=self.name,
-            strains=self.strains,
-            elements=self.elements,
-            length=self.element_length,
-            place=place,
-        )
-        return body, joint
+        within = place.offset[0] / self.element_length - place.element
+        return RigidBody(name, 0.0), self._segment(name, _reference(name), place.element, within)
+
+    def _sleeve(self, sleeve):
+        """The massless bodies between the parts of a sleeve, and these parts."""
+        between = [RigidBody(f"{sleeve.name}[{element + 1}]", 0.0) for element in range(self.elements - 1)]
+        ends = [sleeve.parent, *(body.reference for body in between), sleeve.child]
+        names = [*(body.name for body in between), sleeve.name]
+        parts = [
+            SleevePart(name, ends[element], ends[element + 1], self, element, sleeve.name)
+            for element, name in enumerate(names)
+        ]
+        return between, parts
+
+
+def _reference(body: str) -> Frame:
+    return Frame(body, np.zeros(3), rotation_matrix(None, body))
 
 
 class BeamElasticity(AbstractForce):
@@ -234,36 +244,44 @@ class Parts(NamedTuple):
 
 
 def taken_apart(bodies, joints, forces, constraints) -> Parts:
-    """Beams as sections, joints and forces, where they are not yet; frames at places on them as massless bodies."""
+    """Beams as sections, joints and forces, where they are not yet; places on them, and sleeves, as massless bodies."""
     names = {body.name for body in bodies}
-    beams = {body.name: body for body in bodies if isinstance(body, Beam) and body.sections[0] not in names}
+    beams = {body.name: body for body in bodies if isinstance(body, Beam) and body.nodes[0] not in names}
     bodies = [body for body in bodies if not isinstance(body, Beam) or body.name in beams]
     if not beams:
         return Parts(bodies, joints, forces, constraints)
-    stations = []
+    added, segments = [], [segment for beam in beams.values() for segment in beam._joints()]
 
     def resolved(frame):
-        if not (isinstance(frame, Frame) and frame.body in beams):
+        if not (isinstance(frame, Place) and frame.body in beams):
             return frame
-        name = f"{frame.body}({sum(body.name.startswith(frame.body + '(') for body, _ in stations) + 1})"
-        stations.append(beams[frame.body]._station(name, frame.offset[0]))
+        name = f"{frame.body}({sum(body.name.startswith(frame.body + '(') for body in added) + 1})"
+        body, segment = beams[frame.body]._station(name, frame)
+        added.append(body)
+        segments.append(segment)
         return Frame(name, jnp.asarray(frame.offset) * np.array([0.0, 1.0, 1.0]), frame.rotation)
+
+    def parts(joint):
+        if not (isinstance(joint, Sliding) and joint.beam in beams):
+            return [joint]
+        between, of_sleeve = beams[joint.beam]._sleeve(joint)
+        added.extend(between)
+        return of_sleeve
 
     with_frames = lambda elements: [
         jax.tree.map(resolved, element, is_leaf=lambda part: isinstance(part, Frame)) for element in elements
     ]
     joints, forces, constraints = map(with_frames, (joints, forces, constraints))
-    of_beams = beams.values()
+    joints = [part for joint in joints for part in parts(joint)]
     return Parts(
-        [part for body in bodies for part in (body._bodies() if isinstance(body, Beam) else [body])]
-        + [body for body, _ in stations],
-        [*(segment for beam in of_beams for segment in beam._joints()), *(joint for _, joint in stations), *joints],
-        [*forces, *map(BeamElasticity, of_beams)],
+        [part for body in bodies for part in (body._bodies() if isinstance(body, Beam) else [body])] + added,
+        [*segments, *joints],
+        [*forces, *map(BeamElasticity, beams.values())],
         constraints,
     )
 
 
 def held_first(joints) -> list[set[str]]:
     """Names of joints that must be in the tree, those of beams themselves before those that slide on them."""
-    of_beams = {joint.name for joint in joints if isinstance(joint, BeamSegment | BeamStation)}
+    of_beams = {joint.name for joint in joints if isinstance(joint, BeamSegment)}
     return [of_beams, {joint.name for joint in joints if isinstance(joint, OnBeam)}]

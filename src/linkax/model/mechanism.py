@@ -9,7 +9,7 @@ from linkax.model.bodies import GROUND_NAME, RigidBody
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
 from linkax.model.immobile_rows import split_rows
-from linkax.model.joints.bending import Sliding
+from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
@@ -63,7 +63,7 @@ class Mechanism(eqx.Module):
         first = [*held_first(joints), related, acted_on]
         order, carriers, predecessors, cuts = spanning_tree(list(by_name), joints, first)
         for joint in cuts:
-            if isinstance(joint, Sliding):
+            if isinstance(joint, OnBeam):
                 raise ValueError(
                     f"joint {joint.name!r} slides along a beam and closes a loop; put a massless body on it, and close "
                     "the loop by another joint on that body"

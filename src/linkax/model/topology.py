@@ -22,7 +22,7 @@ class Island(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """Joints in the tree that move in the same way.
+    """Joints in the tree that move in the same way, by as many coordinates.
 
     - `motion`: the type of the joints, or their `motion` where it has one.
     - `bodies`: those that they carry. `places`: where in q the coordinates lie that move each, (n, k).
@@ -180,8 +180,9 @@ class Topology:
         """The joints in the tree by what their motion is."""
         of_motion = {}
         for body, kind in enumerate(self.joint_types[: self.num_bodies]):
-            of_motion.setdefault(kind if kind.motion is None else kind.motion, []).append(body)
-        return tuple(Kind(motion, tuple(bodies), self._read_by(bodies)) for motion, bodies in of_motion.items())
+            alike = (kind, None) if kind.motion is None else (kind.motion, len(self.movers[body]))
+            of_motion.setdefault(alike, []).append(body)
+        return tuple(Kind(motion, tuple(bodies), self._read_by(bodies)) for (motion, _), bodies in of_motion.items())
 
     def _read_by(self, bodies):
         if self.movers[bodies[0]] is None:

@@ -4,12 +4,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import beam_point, configure
+from linkax.equations.configuration import along_speeds, beam_point, configure
 from linkax.equations.coordinates import rates
-from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
+from linkax.equations.dynamics import applied_load, body_accelerations, kinetic_energy, potential_energy
 from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
 from linkax.equations.motion import move
 from linkax.equations.reactions import Reaction, reactions, reactions_to, seen_from
@@ -33,6 +32,17 @@ class Violation(NamedTuple):
     position: Float[Array, "..."]
     velocity: Float[Array, "..."]
     acceleration: Float[Array, "..."]
+
+
+class Power(NamedTuple):
+    """What raises kinetic plus potential energy [W].
+
+    - `forces`: of force elements, beyond the fall of their potential energy; damping counts as negative.
+    - `drives`: of constraints that change with time: drives, winches, cylinders.
+    """
+
+    forces: Float[Array, "..."]
+    drives: Float[Array, "..."]
 
 
 class Instant(NamedTuple):
@@ -74,8 +84,8 @@ class Instant(NamedTuple):
 
     def center_of_mass(self, function, bodies):
         """What `position`, `velocity` or `acceleration` say of the centre of mass of several bodies."""
-        of_bodies = function(self, np.array(bodies), jnp.zeros(3, self.q.dtype))
-        mass = self.system.mass[np.array(bodies)]
+        of_bodies = function(self, bodies, jnp.zeros(3, self.q.dtype))
+        mass = self.system.mass[bodies]
         return mass @ of_bodies / jnp.sum(mass)
 
     def on_beam(self, function, beam, point):
@@ -113,9 +123,9 @@ class Instant(NamedTuple):
         found = reactions(self.motion, self.dynamics.acceleration, self._least_multipliers().multipliers)
         return seen_from(self.configuration, found, on, axes)
 
-    def constraint_force(self, constraint):
+    def constraint_forces(self):
         multipliers = self._least_multipliers().multipliers
-        return sorted_multipliers(self.configuration, multipliers).constraints[constraint]
+        return sorted_multipliers(self.configuration, multipliers).constraints
 
     def _self_stresses(self):
         """Multipliers with Jᵀλ = 0, a row each: those of rows that motion changes, and of rows that none does."""
@@ -138,16 +148,24 @@ class Instant(NamedTuple):
         still = lambda change: jnp.max(jnp.abs(change), axis=0, initial=0.0) <= UNCHANGED
         return Reaction(still(force * self.system.length), still(moment))
 
-    def constraint_unique(self, constraint):
+    def unique_constraint_forces(self):
         topology = self.system.topology
-        row = topology.num_rows - len(topology.constraints) + constraint
-        return jnp.max(jnp.abs(self._self_stresses()[0][:, row]), initial=0.0) <= UNCHANGED
+        rows = self._self_stresses()[0][:, topology.num_rows - len(topology.constraints) :]
+        return jnp.max(jnp.abs(rows), axis=0, initial=0.0) <= UNCHANGED
 
     def kinetic_energy(self):
         return kinetic_energy(self.motion)
 
     def potential_energy(self):
         return potential_energy(self.configuration)
+
+    def power(self):
+        motion, configuration = self.motion, self.configuration
+        load = applied_load(motion)
+        force = load.joint_force + along_speeds(configuration, load.force, load.moment)
+        energy = lambda q: potential_energy(configure(self.system, self.t, q))
+        _, rise = jax.jvp(energy, (self.q,), (rates(self.system.topology, self.q, self.v),))
+        return Power(force @ self.v + rise, self.dynamics.multipliers @ rate(self.system, self.t))
 
     def violation(self):
         return self._violated(self.dynamics)

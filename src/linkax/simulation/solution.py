@@ -15,7 +15,7 @@ from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.instant import Instant, Violation
+from linkax.simulation.instant import Instant, Power, Violation
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
@@ -133,7 +133,7 @@ class Solution(eqx.Module):
         `reaction_unique` tells which components can be relied upon.
         """
         if name in self.mechanism.topology.constraints:
-            return _over_times(Instant.constraint_force, self, self.mechanism.topology.constraints.index(name))
+            return self._of_constraint(Instant.constraint_forces, name)
         return self._of_joint(Instant.reactions, name, on, axes)
 
     def reaction_unique(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
@@ -144,7 +144,7 @@ class Solution(eqx.Module):
         depends on elasticity, assembly, and here on the choice of the tree.
         """
         if name in self.mechanism.topology.constraints:
-            return _over_times(Instant.constraint_unique, self, self.mechanism.topology.constraints.index(name))
+            return self._of_constraint(Instant.unique_constraint_forces, name)
         return self._of_joint(Instant.unique, name, on, axes)
 
     def reactions(self) -> dict[str, Reaction]:
@@ -164,6 +164,10 @@ class Solution(eqx.Module):
     def potential_energy(self) -> Float[Array, "*batch n_t"]:
         """Potential energy of the force elements that have one [J]."""
         return _over_times(Instant.potential_energy, self)
+
+    def power(self) -> Power:
+        """The rate of `energy`, by what causes it [W], each (n_t,)."""
+        return _over_times(Instant.power, self)
 
     def violation(self) -> Violation:
         """Largest violation of the loop rows at each time."""
@@ -208,6 +212,10 @@ class Solution(eqx.Module):
             raise ValueError("evaluate needs a dense solution; simulate with saveat=diffrax.SaveAt(dense=True)")
         return _evaluate(self, t)
 
+    def _of_constraint(self, function, name):
+        """Of all constraints, so that all names share a program, that of one."""
+        return _over_times(function, self)[..., self.mechanism.topology.constraints.index(name)]
+
     def _of_joint(self, function, name, on, axes):
         """Of reactions of all joints, so that all names share a program, those of one."""
         for what, entry, choices in (("on", on, get_args(Side)), ("axes", axes, get_args(Axes))):
@@ -222,26 +230,32 @@ class Solution(eqx.Module):
         if isinstance(self.mechanism.body(name), Beam):
             some = ", ".join(map(repr, self.mechanism.body(name).sections[:3]))
             raise ValueError(f"{name!r} is a beam and bends; ask for one of its sections, {some}, ...")
-        return self.mechanism.topology.bodies.index(name)
+        return self._index(name)
+
+    def _index(self, section):
+        """Of a rigid body, for each member of a batch: a number that is traced, so that all names share a program."""
+        return np.full(self.ts.shape[:-1], self.mechanism.topology.bodies.index(section))
 
     def _of_point(self, function, body, at):
         """A function of an `Instant` for a point of a rigid body or of a beam."""
-        found, names = self.mechanism.body(body), self.mechanism.topology.bodies
+        found = self.mechanism.body(body)
         if isinstance(found, Beam) and at is None:
-            return _over_times(Instant.center_of_mass, self, function, tuple(map(names.index, found.sections)))
+            return _over_times(
+                Instant.center_of_mass, self, function, np.stack([*map(self._index, found.sections)], axis=-1)
+            )
         if at is None:
-            return _over_times(function, self, names.index(body), found.center_of_mass)
+            return _over_times(function, self, self._index(body), found.center_of_mass)
         if isinstance(at, str):
             frame = found.at(at)
             offset = jnp.broadcast_to(frame.offset, (*self.ts.shape[:-1], 3))
-            return _over_times(function, self, names.index(frame.body), offset)
+            return _over_times(function, self, self._index(frame.body), offset)
         what = f"point on body {body!r} [m]"
         if isinstance(found, Beam) and np.ndim(at) == 0:
             at = number(at, (), what) * np.eye(3)[0]
         offset = jnp.broadcast_to(number(at, (3,), what), (*self.ts.shape[:-1], 3))
         if isinstance(found, Beam):
             return _over_times(Instant.on_beam, self, function, found, offset)
-        return _over_times(function, self, names.index(body), offset)
+        return _over_times(function, self, self._index(body), offset)
 
     def _joint(self, function, name):
         self.mechanism.joint(name)

@@ -17,7 +17,7 @@ def rotate(rotation, vector):
 
 
 def compose(first, second):
-    """Product of rotations (..., 3, 3): `second` is applied first to a vector."""
+    """Product of rotations (..., 3, 3), or of other matrices: `second` is applied first to a vector."""
     return jnp.sum(first[..., :, :, None] * second[..., None, :, :], axis=-2)
 
 

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from linkax.spatial.rotations import compose, transpose
+
 TERMS = 16  # enough for turns of π to rounding
 # (1 − cos a) / a² and (a − sin a) / a³ as power series in a².
 SERIES = np.array([[(-1.0) ** k / math.factorial(2 * k + 2 + i) for i in range(2)] for k in range(TERMS)])
@@ -41,11 +43,6 @@ def _series_jvp(order, primals, changes):
     return _series(order, x), _series(order + 1, x) * change[..., None]
 
 
-def product(first, second):
-    """The product of matrices (..., n, n): of two motions, the second one seen from the first."""
-    return first @ second
-
-
 def screw_matrix(screw):
     """The matrices (..., 4, 4) of screws (..., 6)."""
     return jnp.tensordot(screw, jnp.asarray(GENERATORS, screw.dtype), 1)
@@ -53,27 +50,18 @@ def screw_matrix(screw):
 
 def exponential(screw):
     """The motion (Rodrigues) along a constant screw, given as its matrix (..., 4, 4)."""
-    square = product(screw, screw)
+    square = compose(screw, screw)
     # The trace is −2 a².
     series = _series(0, -jnp.trace(square, axis1=-2, axis2=-1) / 2.0)[..., None, None]
     return (
         jnp.eye(4, dtype=screw.dtype)
         + screw
         + series[..., 0, :, :] * square
-        + series[..., 1, :, :] * product(square, screw)
+        + series[..., 1, :, :] * compose(square, screw)
     )
 
 
 def turn_rate(change, rotation):
     """The vector (..., 3) of the antisymmetric part of change × rotationᵀ: the angular velocity of a rate of change."""
-    across = change @ jnp.swapaxes(rotation, -1, -2)
+    across = compose(change, transpose(rotation))
     return jnp.tensordot(across, jnp.asarray(np.swapaxes(LEVI_CIVITA, 0, 2) / 2.0, across.dtype), 2)
-
-
-def chain(motions):
-    """The product of motions (n, 4, 4), each seen from the one before."""
-    while len(motions) > 1:
-        if len(motions) % 2:
-            motions = jnp.concatenate([motions, jnp.eye(4, dtype=motions.dtype)[None]])
-        motions = product(motions[::2], motions[1::2])
-    return motions[0]

@@ -2,26 +2,27 @@
 
 Along a beam the section's axes R and its place p follow the strains of the axis, twist and curvatures κ
 and stretch and shears γ: R' = R κ̂, p' = R (e₁ + γ) (Reissner, 1973; Simo, 1985). Strains are linear
-between nodes; from one section to another within an element the solution is the exponential of a
-screw (Magnus series to fourth order, exact where strains are constant).
+between nodes; from an element's first node to a section of it the solution is the exponential of a
+screw (Magnus series to sixth order: Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009; exact
+where strains are constant).
 """
 
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from linkax.model.joints.joint import AbstractJoint, JointKind, Motion
 from linkax.model.terms import Term
-from linkax.spatial.screws import chain, exponential, product, screw_matrix
+from linkax.spatial.rotations import compose
+from linkax.spatial.screws import exponential, screw_matrix
 
 NUM_STRAINS = 6
-# Where an element has sections: at its nodes, and between them where Gauss's rule with two points has its mass. (Its
-# error and that of the strains have opposite signs in frequencies; those of Simpson's rule have equal ones.)
-STATIONS = np.array([0.0, 0.5 - np.sqrt(1.0 / 12.0), 0.5 + np.sqrt(1.0 / 12.0), 1.0])
+# Where an element has its mass, between its nodes: Gauss's rule with two points. (Its error and that of the strains
+# have opposite signs in frequencies; those of Simpson's rule have equal ones.)
+MASS_PLACES = np.array([0.5 - np.sqrt(1.0 / 12.0), 0.5 + np.sqrt(1.0 / 12.0)])
 
 
 def strain_unit(strain: int) -> str:
@@ -29,69 +30,65 @@ def strain_unit(strain: int) -> str:
     return "rad" if strain < 3 else "m"
 
 
-def _along_element(first, second, length, begin, end):
-    """The motion from one section to another of an element.
+def _along_element(first, second, length, end):
+    """The motion from an element's first node to a section.
 
-    `first`, `second`: strains at its nodes times its `length`, (6,) each; `begin`, `end`: from 0 to 1.
+    `first`, `second`: strains at its nodes times its `length`, (6,) each; `end`: where the section is, from 0 to 1.
     """
-    part, middle = end - begin, (begin + end) / 2.0
-    straight = length * np.eye(NUM_STRAINS)[3]
-    strain, slope = first + middle * (second - first) + straight, second - first
-    strain, slope = screw_matrix(strain), screw_matrix(slope)
-    bracket = product(strain, slope) - product(slope, strain)
-    return exponential(part * strain + part**3 / 12.0 * bracket)
+    slope, straight = second - first, length * np.eye(NUM_STRAINS)[3]
+    begin, slope = screw_matrix(first + straight), screw_matrix(slope)
+    middle, slope = end * (begin + end / 2.0 * slope), end**2 * slope
+    turned = _bracket(middle, slope)
+    return exponential(middle + _bracket(turned - 20.0 * middle, slope - _bracket(middle, turned) / 60.0) / 240.0)
+
+
+def _bracket(first, second):
+    """Of screws along which motions follow each other from the left to the right."""
+    return compose(second, first) - compose(first, second)
+
+
+def _all_strains(coordinates, strains):
+    """All components of strain at nodes, times the element's length, (n, 6), where coordinates are some of them."""
+    given = coordinates.reshape(-1, len(strains))
+    return jnp.zeros((len(given), NUM_STRAINS), coordinates.dtype).at[:, np.array(strains)].set(given)
+
+
+def section_at(coordinates, strains, length, place):
+    """A section at a place [m], seen from the first node of its element, and which element that is.
+
+    `coordinates`: of the whole beam; `strains`: which ones they are; `length`: of an element.
+    """
+    of_nodes = _all_strains(coordinates, strains)
+    element = jnp.clip(jnp.floor(place / length), 0, len(of_nodes) - 2).astype(int)
+    return _along_element(of_nodes[element], of_nodes[element + 1], length, place / length - element), element
 
 
 @dataclasses.dataclass(frozen=True)
-class _OfStrains(Motion):
-    """- `strains`: which components are coordinates; the others are zero."""
+class WithinElement(Motion):
+    """From an element's first node to a section of it, at a distance that a last coordinate may add to.
+
+    Numbers: the element's length, where the section is from 0 to 1 without that coordinate, and whether the way
+    may go on before the element, and behind it; else it ends there.
+
+    - `strains`: which components are coordinates; the others are zero.
+    """
 
     strains: tuple[int, ...]
 
-    def _of_nodes(self, coordinates):
-        """All components of strain at the nodes, times the element's length, (n, 6)."""
-        given = coordinates.reshape(-1, len(self.strains))
-        return jnp.zeros((len(given), NUM_STRAINS), coordinates.dtype).at[:, np.array(self.strains)].set(given)
-
-
-@dataclasses.dataclass(frozen=True)
-class WithinElement(_OfStrains):
-    """From one section of an element to another. Numbers: the element's length, and where both are in it."""
-
     def __call__(self, coordinates, numbers):
-        return _along_element(*self._of_nodes(coordinates), *numbers)
-
-
-@dataclasses.dataclass(frozen=True)
-class AlongBeam(_OfStrains):
-    """From a beam's base to a section anywhere on it, by way of the same sections as those of `Beam`.
-
-    Numbers: the length of an element, and the section's place [m], which is the last coordinate where it
-    `slides`. Beyond its ends the beam goes on with the strains of its last elements.
-    """
-
-    slides: bool
-
-    def __call__(self, coordinates, numbers):
-        length, *place = numbers
-        if self.slides:
-            coordinates, place = coordinates[:-1], [coordinates[-1]]
-        strains = self._of_nodes(coordinates)
-        element = np.repeat(np.arange(len(strains) - 1), len(STATIONS) - 1)
-        begin, most = (np.tile(of_element, len(strains) - 1) for of_element in (STATIONS[:-1], np.diff(STATIONS)))
-        first, last = np.arange(len(element)) == 0, np.arange(len(element)) == len(element) - 1
-        part = place[0] / length - (element + begin)
-        part = jnp.where((part > 0.0) | first, part, 0.0)
-        part = jnp.where((part < most) | last, part, most)
-        along = jax.vmap(_along_element, in_axes=(0, 0, None, 0, 0))
-        return chain(along(strains[element], strains[element + 1], length, begin, begin + part))
+        length, place, goes_before, goes_behind = numbers
+        strains, along = jnp.split(coordinates, [2 * len(self.strains)])
+        end = place + jnp.sum(along) / length
+        end = jnp.where((end >= 0.0) | (goes_before > 0.0), end, 0.0)
+        end = jnp.where((end < 1.0) | (goes_behind > 0.0), end, 1.0)
+        return _along_element(*_all_strains(strains, self.strains), length, end)
 
 
 class OnBeam(AbstractJoint):
-    """A joint in the tree that moves as a beam bends; it is never cut.
+    """A joint in the tree that moves as an element of a beam bends; it is never cut.
 
     - `beam`: the name of the joint that has the beam's strains as coordinates.
-    - `strains`: see `linkax.Beam`; `elements`: their number; `length`: of an element [m].
+    - `strains`: see `linkax.Beam`; `elements`: their number; `length`: of an element [m]; `element`: which one.
     """
 
     locked_rotations = ()
@@ -102,26 +99,26 @@ class OnBeam(AbstractJoint):
     strains: tuple[int, ...] = eqx.field(static=True)
     elements: int = eqx.field(static=True)
     length: Float[Array, ""]
+    element: int = eqx.field(static=True)
 
-    def __init__(self, name, parent, child, beam, strains, elements, length):
+    def __init__(self, name, parent, child, beam, element):
         super().__init__(name, parent, child, "x")
-        self.beam, self.strains, self.elements, self.length = beam, strains, elements, length
-
-    def _terms(self, first_node, last_node):
-        count = len(self.strains)
-        return tuple(Term(self.beam, index) for index in range(first_node * count, (last_node + 1) * count))
+        self.beam, self.strains, self.elements, self.length = (
+            beam.name,
+            beam.strains,
+            beam.elements,
+            beam.element_length,
+        )
+        self.element = element
 
     @property
     def movers(self):
-        return self._terms(0, self.elements)
+        count = len(self.strains)
+        return tuple(Term(self.beam, index) for index in range(self.element * count, (self.element + 2) * count))
 
     @property
     def speed_units(self):
         return self.kind.speed_units
-
-    @property
-    def reach(self):
-        return self.length * self.elements
 
     @property
     def angular_subspace(self):
@@ -146,18 +143,16 @@ class OnBeam(AbstractJoint):
 
 
 class BeamSegment(OnBeam):
-    """From one section of a beam to the next; `begin`, `end`: where both are in their `element`, from 0 to 1.
+    """From the first node of an element to a section of it, at a `place` from 0 to 1.
 
     The one that has the beam's name has the strains of all nodes as coordinates.
     """
 
-    element: int = eqx.field(static=True)
-    begin: float = eqx.field(static=True)
-    end: float = eqx.field(static=True)
+    place: Float[Array, ""]
 
-    def __init__(self, name, parent, child, beam, strains, elements, length, element, begin, end):
-        super().__init__(name, parent, child, beam, strains, elements, length)
-        self.element, self.begin, self.end = element, begin, end
+    def __init__(self, name, parent, child, beam, element, place):
+        super().__init__(name, parent, child, beam, element)
+        self.place = place
 
     @property
     def kind(self):
@@ -165,34 +160,43 @@ class BeamSegment(OnBeam):
         return JointKind("BeamSegment", WithinElement(self.strains), (self.elements + 1) * of_node)
 
     @property
-    def movers(self):
-        return self._terms(self.element, self.element + 1)
-
-    @property
     def numbers(self):
-        return jnp.stack(jnp.broadcast_arrays(self.length, self.begin, self.end))
+        return jnp.stack(jnp.broadcast_arrays(self.length, self.place, 1.0, 1.0))
 
     @property
     def reach(self):
-        return self.length * (self.end - self.begin)
+        return self.length * self.place
 
 
-class BeamStation(OnBeam):
-    """From a beam's base to the section at a `place` [m] on it."""
+class SleevePart(OnBeam):
+    """A part of `Sliding`, in one element. The last one has the sleeve's name and its coordinate."""
 
-    place: Float[Array, ""]
+    sleeve: str = eqx.field(static=True)
 
-    def __init__(self, name, parent, child, beam, strains, elements, length, place):
-        super().__init__(name, parent, child, beam, strains, elements, length)
-        self.place = place
+    def __init__(self, name, parent, child, beam, element, sleeve):
+        super().__init__(name, parent, child, beam, element)
+        self.sleeve = sleeve
 
     @property
     def kind(self):
-        return JointKind("BeamStation", AlongBeam(self.strains, slides=False), ())
+        return JointKind("Sliding", WithinElement(self.strains), ("m",) if self.name == self.sleeve else ())
+
+    @property
+    def movers(self):
+        return (*super().movers, Term(self.sleeve, None))
 
     @property
     def numbers(self):
-        return jnp.stack(jnp.broadcast_arrays(self.length, self.place))
+        ends = float(self.element == 0), float(self.element == self.elements - 1)
+        return jnp.stack(jnp.broadcast_arrays(self.length, -float(self.element), *ends))
+
+    @property
+    def reach(self):
+        return self.length
+
+    @property
+    def linear_subspace(self):
+        return tuple(dict.fromkeys([(1.0, 0.0, 0.0), *super().linear_subspace]))
 
 
 class Sliding(OnBeam):
@@ -203,6 +207,9 @@ class Sliding(OnBeam):
     which does not turn with the section, put a massless body on the sleeve and another joint on that.
     Beyond its ends the beam goes on as its last elements end.
 
+    A mechanism takes it apart into parts, one for each element, with massless bodies such as "sleeve[1]"
+    between them; the last part keeps its name, its coordinate and its reaction.
+
     **Arguments:** `name`, unique among joints; `beam`, a `linkax.Beam`; `child`: a body (its reference
     frame) or `body.at(...)`.
     """
@@ -210,20 +217,8 @@ class Sliding(OnBeam):
     def __init__(self, name: str, beam, child):
         if not hasattr(beam, "elements"):
             raise ValueError(f"joint {name!r}: beam is {beam!r}; give a lx.Beam, and any body as child")
-        super().__init__(name, beam, child, beam.name, beam.strains, beam.elements, beam.element_length)
+        super().__init__(name, beam, child, beam, beam.elements - 1)
 
     @property
     def kind(self):
-        return JointKind("Sliding", AlongBeam(self.strains, slides=True), ("m",))
-
-    @property
-    def movers(self):
-        return (*super().movers, Term(self.name, None))
-
-    @property
-    def numbers(self):
-        return jnp.reshape(self.length, (1,))
-
-    @property
-    def linear_subspace(self):
-        return tuple(dict.fromkeys([(1.0, 0.0, 0.0), *super().linear_subspace]))
+        return JointKind("Sliding", WithinElement(self.strains), ("m",))

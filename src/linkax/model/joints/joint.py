@@ -20,7 +20,10 @@ class Motion(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, coordinates: Float[Array, " n"], numbers: Float[Array, " k"]):
-        """The child's frame seen from the parent's, in joint axes, (4, 4), see `linkax.spatial.screws`."""
+        """The child's frame seen from the parent's, in joint axes, (4, 4), see `linkax.spatial.screws`.
+
+        Of joints with the same motion that have fewer coordinates than others, the last ones may be given as zero.
+        """
 
 
 @dataclasses.dataclass(frozen=True)
