@@ -6,7 +6,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Int
 
@@ -68,9 +67,9 @@ class _Nearby(eqx.Module):
         """Coordinates q."""
         return retract(self.system.topology, self.q, self.basis @ y)
 
-    def slopes(self, function):
-        """A function of y at zero, and its derivative."""
-        rest = jnp.zeros_like(self.system.units)
+    @staticmethod
+    def slopes(function, rest):
+        """A function of a vector at `rest`, and its derivative."""
         follow = lambda change: jax.jvp(function, (rest,), (change,))
         return jax.vmap(follow, out_axes=(None, 1))(jnp.eye(len(rest), dtype=rest.dtype))
 
@@ -94,7 +93,7 @@ class _Still(_Nearby):
 
     def at_rest(self):
         """The force at y = 0, and the stiffness, minus its derivative."""
-        force, slopes = self.slopes(self.force)
+        force, slopes = self.slopes(self.force, jnp.zeros_like(self.system.units))
         return force, -slopes
 
 
@@ -257,13 +256,17 @@ def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: 
     """
     t = jnp.asarray(t, float)
     if degrees_of_freedom is None:
-        system = _held_system(mechanism, state.q.dtype, t)
-        departure = BALANCED.method(system.dtype).departure(system, t, state.q)
-        rank = known(departure.crossing.inverse.rank)
+        rank = known(_rank(mechanism, state, t))
         if rank is None:
             raise ValueError("linearise inside a JAX transformation needs degrees_of_freedom=")
-        degrees_of_freedom = system.topology.num_speeds - int(np.sum(rank))
+        degrees_of_freedom = mechanism.topology.num_speeds - int(rank)
     return _linearise(mechanism, state, t, degrees_of_freedom)
+
+
+@eqx.filter_jit
+def _rank(mechanism, state, t):
+    system = _held_system(mechanism, state.q.dtype, t)
+    return jnp.sum(BALANCED.method(system.dtype).crossing(system, t, state.q).inverse.rank)
 
 
 @eqx.filter_jit
@@ -274,8 +277,8 @@ def _linearise(mechanism, state, t, count):
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
     columns = jnp.argsort(jnp.sum(moving.basis**2, axis=0) == 0.0)[:count]
     at_columns = lambda matrix: matrix[columns[:, None], columns[None, :]]
-    stiffness = at_columns(-moving.slopes(lambda y: moving.acceleration(y, rest))[1])
-    damping = at_columns(-moving.slopes(lambda y_rate: moving.acceleration(rest, y_rate))[1])
+    _, slopes = moving.slopes(lambda both: moving.acceleration(*jnp.split(both, 2)), jnp.concatenate([rest, rest]))
+    stiffness, damping = (at_columns(-part) for part in jnp.split(slopes, 2, axis=1))
     values, vectors = jnp.linalg.eigh((stiffness + stiffness.T) / 2.0)
     basis = moving.basis[:, columns]
     return Linearisation(

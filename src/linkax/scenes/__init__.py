@@ -8,8 +8,18 @@ from linkax.scenes.planar_four_bar import PLANAR_FOUR_BAR
 from linkax.scenes.rigid_crane import RIGID_CRANE
 from linkax.scenes.scene import Scene
 from linkax.scenes.spatial_four_link import SPATIAL_FOUR_LINK
+from linkax.scenes.telescopic_crane import TELESCOPIC_CRANE
 
-_ALL = (PENDULUM, CRANK_SLIDER, N_FOUR_BAR, SPATIAL_FOUR_LINK, PLANAR_FOUR_BAR, BRICARD, RIGID_CRANE)
+_ALL = (
+    PENDULUM,
+    CRANK_SLIDER,
+    N_FOUR_BAR,
+    SPATIAL_FOUR_LINK,
+    PLANAR_FOUR_BAR,
+    BRICARD,
+    RIGID_CRANE,
+    TELESCOPIC_CRANE,
+)
 SCENES: dict[str, Scene] = {scene.name: scene for scene in _ALL}
 
 

@@ -1,0 +1,192 @@
+"""Telescopic crane with a flexible boom: example c of the paper (Figs. 16 to 20), with numbers of our own.
+
+A turntable carries a boom of three box sections that bend. Each slides in the one before, on a pad at
+its own rear end and on another at the front end of the other. One cylinder luffs the boom, another
+pushes the second section out, and a rope from the first section, over a sheave at the front of the
+second, pulls the third one out as far. The load hangs on a rope from the tip.
+
+Sizes are about those of a mobile crane for 30 tonnes; they are from no data sheet.
+"""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+import linkax as lx
+from linkax.scenes.scene import Scene, Variant
+
+SECTION = 10.0  # length of each section [m]
+FOOT = (2.0, -1.0)  # of the luffing cylinder, from the boom's pivot [m]
+HEAD = 4.0  # of the luffing cylinder, along the boom [m]
+END = 1.0  # of the extension rope and its sheave, from the ends of the sections [m]
+SHEAVE = 0.2  # of the same, above the axes of the sections [m]
+STEEL = {"poissons_ratio": 0.3, "density": 7850.0}
+
+
+class Course(eqx.Module):
+    """From one value to another in a time [s], smoothly (a polynomial of fifth degree)."""
+
+    begin: Float[Array, ""]
+    end: Float[Array, ""]
+    duration: Float[Array, ""]
+
+    def __call__(self, t):
+        s = jnp.clip(t / self.duration, 0.0, 1.0)
+        return self.begin + (self.end - self.begin) * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+class Reach(eqx.Module):
+    """Length of the luffing cylinder [m], where the angle of the boom, unbent, takes a course."""
+
+    angle: Course
+
+    def __call__(self, t):
+        return reach(self.angle(t))
+
+
+def reach(angle):
+    """Length of the luffing cylinder at an angle of the boom, unbent [m]."""
+    return jnp.hypot(HEAD * jnp.cos(angle) - FOOT[0], HEAD * jnp.sin(angle) - FOOT[1])
+
+
+def _course(parameters, name):
+    begin, end = parameters[name], parameters[f"{name}_change"]
+    return Course(*map(jnp.asarray, (begin, begin + end, parameters["duration"])))
+
+
+def _boom(parameters):
+    steel = lx.Material(parameters["modulus"], **STEEL)
+    planar = parameters["planes"] == 1
+    return [
+        lx.Beam(
+            f"section_{index}",
+            SECTION,
+            lx.rectangle(*(parameters[f"{size}_{index}"] for size in ("height", "width")), steel, parameters["wall"]),
+            elements=parameters["elements"],
+            bends="z" if planar else "yz",
+            torsion=not planar,
+            stretch=False,
+            damping=parameters["damping"],
+        )
+        for index in (1, 2, 3)
+    ]
+
+
+def _telescope(outer, inner, index, pad):
+    """The pads between two sections: massless shoes that slide on one, and joints from these to the other."""
+    rear, front = (lx.point_mass(f"{end}_shoe_{index}", 0.0) for end in ("rear", "front"))
+    return [rear, front], [
+        lx.Sliding(f"extension_{index}", outer, rear),
+        pad(f"rear_pad_{index}", rear, inner),
+        lx.Sliding(f"overlap_{index}", inner, front),
+        pad(f"front_pad_{index}", front, outer.at("tip"), cut=True),
+    ]
+
+
+def _mechanism(parameters):
+    boom = first, second, third = _boom(parameters)
+    planar = parameters["planes"] == 1
+
+    def hinge(name, parent, child, cut=False):
+        if planar:
+            return lx.Revolute(name, parent, child, axis="z", cut=cut)
+        return lx.Universal(name, parent, child, axis="z", second_axis="y", cut=cut)
+
+    turntable = lx.RigidBody("turntable", 1e4, inertia=[2e4, 3e4, 2e4])
+    payload = lx.point_mass("payload", parameters["payload"])
+    shoes_2, pads_2 = _telescope(first, second, 2, hinge)
+    shoes_3, pads_3 = _telescope(second, third, 3, hinge)
+    extension = _course(parameters, "extension")
+    above = lambda section, along: section.at([along, SHEAVE, 0.0])
+    return lx.Mechanism(
+        [turntable, *boom, *shoes_2, *shoes_3, payload],
+        [
+            lx.Revolute("slew", lx.GROUND, turntable, axis="y"),
+            lx.Revolute("pivot", turntable, first, axis="z"),
+            *pads_2,
+            *pads_3,
+            hinge("hook", third.at("tip"), payload.at([0.0, parameters["hoist"], 0.0])),
+        ],
+        [lx.Gravity([0.0, -parameters["gravity"], 0.0])],
+        [
+            lx.Drive("slewing", "slew", _course(parameters, "slew")),
+            lx.Rope("luffing", [turntable.at([*FOOT, 0.0]), first.at(HEAD)], Reach(_course(parameters, "angle"))),
+            lx.Drive("telescoping", "extension_2", extension),
+            lx.Rope(
+                "extension_rope",
+                [above(first, SECTION - END), above(second, SECTION - END), above(third, END)],
+                SECTION - 2.0 * END,  # so that both extensions are equal where nothing bends
+            ),
+        ],
+    )
+
+
+def _initial(mechanism, parameters):
+    """At rest, bent by the load that hangs on it before."""
+    before = _mechanism(parameters | {"payload": parameters["payload"] + parameters["dropped"]})
+    extension, angle = parameters["extension"], parameters["angle"]
+    guess = {"slew": parameters["slew"], "pivot": angle, "hook": -angle}
+    for index in (2, 3):
+        guess |= {f"extension_{index}": extension, f"overlap_{index}": SECTION - extension}
+    if parameters["planes"] != 1:
+        guess["hook"] = [-angle, 0.0]
+    return lx.equilibrium(before, lx.assemble(before, guess=guess))
+
+
+TELESCOPIC_CRANE = Scene(
+    name="telescopic-crane",
+    summary="crane with a boom of three sections that bend and slide in each other (example c of the paper)",
+    parameters={
+        "modulus": 2.1e11,
+        "wall": 0.008,
+        **{f"height_{index}": size for index, size in ((1, 0.7), (2, 0.6), (3, 0.5))},
+        **{f"width_{index}": size for index, size in ((1, 0.5), (2, 0.44), (3, 0.38))},
+        "damping": 2e-3,
+        "elements": 2,
+        "planes": 1,
+        "payload": 2000.0,
+        "dropped": 0.0,
+        "hoist": 5.0,
+        "gravity": 9.81,
+        "duration": 8.0,
+        "slew": 0.0,
+        "slew_change": 0.0,
+        "angle": math.pi / 3,
+        "angle_change": 0.0,
+        "extension": 6.0,
+        "extension_change": 0.0,
+    },
+    meanings={
+        "modulus": "Young's modulus of the sections [Pa]",
+        "wall": "thickness of their walls [m]",
+        **{f"height_{index}": f"of section {index} [m]" for index in (1, 2, 3)},
+        **{f"width_{index}": f"of section {index} [m]" for index in (1, 2, 3)},
+        "damping": "time by which strain rates count as strains [s]",
+        "elements": "of each section",
+        "planes": "1: the boom bends in the luffing plane; 2: sideways too, and it twists",
+        "payload": "mass on the hook [kg]",
+        "dropped": "mass that hangs there too until t = 0 [kg]",
+        "hoist": "length of the hoist rope [m]",
+        "gravity": "along -y [m/s²]",
+        "duration": "of all changes, from t = 0 on [s]",
+        "slew": "angle of the turntable, at the start [rad]",
+        "slew_change": "what it turns [rad]",
+        "angle": "of the boom from the horizontal, unbent, at the start [rad]",
+        "angle_change": "what the luffing cylinder lifts it [rad]",
+        "extension": "of each section out of the one before, at the start [m]",
+        "extension_change": "what the telescoping cylinder and the rope push out each [m]",
+    },
+    variants={
+        "release": Variant("the load drops", {"payload": 100.0, "dropped": 1900.0}),
+        "luffing": Variant("lifted by 15 degrees", {"angle": math.pi / 4, "angle_change": math.pi / 12}, t1=10.0),
+        "telescoping": Variant("pushed out under load", {"extension": 4.0, "extension_change": 4.0}, t1=10.0),
+        "slewing": Variant("turned by a quarter", {"planes": 2, "slew_change": math.pi / 2}, t1=10.0),
+    },
+    default_variant="release",
+    t1=3.0,
+    mechanism=_mechanism,
+    initial=_initial,
+    points=lambda parameters: {"tip": ("section_3", "tip"), "load": ("payload", None)},
+)
