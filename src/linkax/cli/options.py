@@ -10,6 +10,7 @@ import diffrax
 import linkax as lx
 from linkax.scenes import scene
 from linkax.simulation.runge_kutta import RungeKutta4
+from linkax.simulation.simulate import default_solver
 
 PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
 OF_DIFFRAX = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno5")
@@ -24,7 +25,8 @@ def add_run_options(parser):
     parser.add_argument("--set", dest="changes", action="append", default=[], metavar="NAME=VALUE", help="a parameter")
     parser.add_argument("--preset", default="balanced", type=one_of(PRESETS), help=f"{', '.join(PRESETS)}")
     parser.add_argument("--rtol", type=positive, metavar="X", help="tolerance of a step, instead of the preset's")
-    parser.add_argument("--solver", default="dopri8", type=one_of(SOLVERS), help=f"{', '.join(SOLVERS)}")
+    solvers = f"{', '.join(SOLVERS)} (default: kvaerno5 for scenes with beams, dopri8 for others)"
+    parser.add_argument("--solver", type=one_of(SOLVERS), help=solvers)
     parser.add_argument("--dt", type=positive, metavar="S", help="fixed steps [s], instead of ones that adapt")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the files (default: under linkax-out)")
     parser.add_argument("--no-plots", action="store_true", help="write no pictures")
@@ -42,8 +44,9 @@ class Run:
         self.parameters = self.scene.settings(self.variant, _changes(arguments.changes))
         self.t1 = self.scene.duration(self.variant) if arguments.t1 is None else arguments.t1
         self.accuracy = PRESETS[arguments.preset] if arguments.rtol is None else lx.Accuracy(rtol=arguments.rtol)
-        self.solver = SOLVERS[arguments.solver]()
         self.mechanism = self.scene.mechanism(self.parameters)
+        asked = arguments.solver
+        self.solver = default_solver(self.mechanism) if asked is None else SOLVERS[asked]()
         self.points = self.scene.points(self.parameters)
         self.described = {
             "scene": self.scene.name,
@@ -52,7 +55,7 @@ class Run:
             "preset": arguments.preset if arguments.rtol is None and arguments.dt is None else None,
             "rtol": float(self.accuracy.rtol) if arguments.dt is None else None,
             "step": arguments.dt,
-            "solver": arguments.solver,
+            "solver": next(name for name, kind in SOLVERS.items() if type(self.solver) is kind),
             "parameters": {name: float(entry) for name, entry in self.parameters.items()},
         }
 

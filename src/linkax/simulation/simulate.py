@@ -62,7 +62,7 @@ def simulate(
     - `saveat`: as in diffrax; default 201 times, evenly from t0 to t1. What is saved lies on the
       closed loops, as does the `State` that a `fn` of its own gets by (t, state, mechanism), but for
       classical formulations without a correction.
-    - `solver`: a diffrax solver, default `Dopri8`.
+    - `solver`: a diffrax solver, see `default_solver`.
     - `stepsize_controller`: replaces rtol and atol of `accuracy`. It sees coordinates in radians
       and lengths of the mechanism, each of magnitude one, and speeds relative to the largest.
     - `adjoint`: of diffrax. By default both modes work, over the steps that the run took, where the solver is an
@@ -93,7 +93,7 @@ def simulate(
         formulation = named_formulation(formulation)
     if not (formulation is None or isinstance(formulation, AbstractFormulation)):
         raise ValueError(f"formulation is {formulation!r}; give a name, a linkax.ClassicalFormulation, or None")
-    solver = diffrax.Dopri8() if solver is None else solver
+    solver = default_solver(mechanism) if solver is None else solver
     replayed = adjoint is None and _saves_states(saveat) and is_replayable(solver, saveat, event, max_steps)
     if adjoint is None:
         adjoint = diffrax.ForwardMode() if replayed else diffrax.RecursiveCheckpointAdjoint()
@@ -121,6 +121,11 @@ def simulate(
     if throw and all_known(solution):
         _raise_if_failed(solution, state)
     return solution
+
+
+def default_solver(mechanism: Mechanism) -> diffrax.AbstractSolver:
+    """`Kvaerno5`, implicit, for mechanisms with beams, whose fast waves are not to choose the steps; else `Dopri8`."""
+    return diffrax.Kvaerno5() if mechanism.beams else diffrax.Dopri8()
 
 
 def fixed_steps(step: float | None, t1: float) -> dict:
