@@ -1,0 +1,52 @@
+"""What the telescopic crane is compared with: a chain of beams."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import linkax as lx
+from linkax.scenes import SCENES
+from linkax.scenes.telescopic_crane import END, HEAD, SECTION, SHEAVE
+
+SCENE = SCENES["telescopic-crane"]
+
+
+def deflection(mechanism, state, parameters):
+    """How far the tip of the boom gives way across it, from where it were if nothing bent [m]."""
+    angle = parameters["angle"]
+    tip = lx.Solution.of_state(mechanism, state).position("section_3", at="tip")[0]
+    return jnp.sin(angle) * tip[0] - jnp.cos(angle) * tip[1]
+
+
+def chain_of_beams(parameters):
+    """The same, by a chain of straight beams (Euler and Bernoulli) and virtual work, for small deflections [m].
+
+    Each section stands on two pads; cylinders and ropes act along the boom, ropes above its axis.
+    """
+    gravity, extension = parameters["gravity"], parameters["extension"]
+    across, lengthwise = gravity * np.cos(parameters["angle"]), gravity * np.sin(parameters["angle"])
+    beams = [SCENE.mechanism(parameters).body(f"section_{index}") for index in (1, 2, 3)]
+    density = np.array([float(beam.section.linear_density) for beam in beams])
+    stiffness = np.array([float(beam.section.bending_stiffness[1]) for beam in beams])
+    overlap = SECTION - extension
+
+    def moments(load, weights, tension):
+        """Bending moments along the sections, from the rear, where these loads act: forces up count as positive."""
+        x = np.linspace(0.0, SECTION, 4001)
+        found, on_tip, on_shoe = [], -load, 0.0
+        for index, couple in ((2, -1.0), (1, 2.0), (0, -1.0)):
+            couple_at, couple = END if index == 2 else SECTION - END, couple * SHEAVE * tension
+            # What carries it in front: a pad, or the luffing cylinder.
+            support, weight = overlap if index > 0 else HEAD, weights[index]
+            around_rear = on_tip * SECTION + on_shoe * extension - weight * SECTION**2 / 2.0 + couple
+            in_front = -around_rear / support
+            forces = [(SECTION, on_tip), (extension, on_shoe), (support, in_front)]
+            moment = -weight * (SECTION - x) ** 2 / 2.0 + couple * (x < couple_at)
+            found.append(moment + sum(force * np.maximum(place - x, 0.0) for place, force in forces))
+            rear = weight * SECTION - on_tip - on_shoe - in_front
+            on_tip, on_shoe = -in_front, -rear
+        return x, np.array(found[::-1])
+
+    tension = (density[2] * SECTION + parameters["payload"]) * lengthwise
+    x, real = moments(parameters["payload"] * across, density * across, tension)
+    _, virtual = moments(1.0, 0.0 * density, 0.0)
+    return np.sum(np.trapezoid(real * virtual, x, axis=1) / stiffness)
