@@ -182,7 +182,6 @@ TELESCOPIC_CRANE = Scene(
         "release": Variant("the load drops", {"payload": 100.0, "dropped": 1900.0}),
         "luffing": Variant("lifted by 15 degrees", {"angle": math.pi / 4, "angle_change": math.pi / 12}, t1=10.0),
         "telescoping": Variant("pushed out under load", {"extension": 4.0, "extension_change": 4.0}, t1=10.0),
-        "slewing": Variant("turned by a quarter", {"planes": 2, "slew_change": math.pi / 2}, t1=10.0),
     },
     default_variant="release",
     t1=3.0,
