@@ -207,11 +207,11 @@ def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " 
 
 def beam_point(configuration: Configuration, beam: Beam, point) -> Float[Array, "3"]:
     """A point (3,) fixed to the section of a beam at point[0], in the world [m]."""
-    nodes = np.array([configuration.body(name) for name in beam.nodes])
+    nodes = jnp.array([configuration.body(name) for name in beam.nodes])
     coordinates = configuration.joint_coordinates(beam.name)
     section, element = section_at(coordinates, beam.strains, beam.element_length, point[0])
     seen = section[:3, 3] + section[:3, 1:3] @ point[1:]
-    node = jnp.asarray(nodes)[element]
+    node = nodes[element]
     return configuration.world_position()[node] + configuration.rotation[node] @ seen
 
 

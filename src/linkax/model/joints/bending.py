@@ -103,13 +103,8 @@ class OnBeam(AbstractJoint):
 
     def __init__(self, name, parent, child, beam, element):
         super().__init__(name, parent, child, "x")
-        self.beam, self.strains, self.elements, self.length = (
-            beam.name,
-            beam.strains,
-            beam.elements,
-            beam.element_length,
-        )
-        self.element = element
+        self.beam, self.strains = beam.name, beam.strains
+        self.elements, self.element, self.length = beam.elements, element, beam.element_length
 
     @property
     def movers(self):
