@@ -29,7 +29,8 @@ class Inverse(NamedTuple):
     - `distance` d: |R_rr| / |R₁₁|, r the rank here or that of the neighbourhood where it is
       known; falls to zero in a singular configuration. One without rows.
     - `definiteness`: of W: the smallest of the squared diagonal of its Cholesky factor over its own
-      diagonal; rounding or not a number where the mass matrix is singular on the tangent space.
+      diagonal, or over the rounding of the largest where that is more; rounding or not a number where
+      the mass matrix is singular on the tangent space.
     """
 
     tangent: Float[Array, "n n"]
@@ -208,8 +209,10 @@ def with_mass(inverse: Inverse, mass) -> Inverse:
     """The inverse for another mass matrix on the same split: M needs to be definite on T alone."""
     mass = lax.stop_gradient(mass)
     basis = inverse.basis
-    empty = jnp.diag((jnp.sum(basis**2, axis=0) == 0.0).astype(mass.dtype))
-    to_basis, definiteness = _lower_inverse(basis.T @ mass @ basis + empty)
+    projected, is_empty = basis.T @ mass @ basis, jnp.sum(basis**2, axis=0) == 0.0
+    largest = jnp.max(jnp.diagonal(projected), initial=0.0)
+    empty = jnp.diag(jnp.where(is_empty, jnp.where(largest > 0.0, largest, 1.0), 0.0))
+    to_basis, definiteness = _lower_inverse(projected + empty)
     root = to_basis @ basis.T
     tangent = root.T @ root
     normal = inverse.normal - tangent @ (mass @ inverse.normal)
@@ -224,7 +227,10 @@ def _ratio(a, b, otherwise):
 def _lower_inverse(matrix):
     """L⁻¹ of a positive definite matrix L Lᵀ, and its definiteness (see `Inverse`)."""
     inverse, diagonal = cholesky_inverse(matrix)
-    return inverse, jnp.min(_ratio(diagonal**2, jnp.diagonal(matrix), 0.0), initial=1.0)
+    own = jnp.diagonal(matrix)
+    # A point mass that turns about itself has an inertia of rounding squared.
+    own = jnp.maximum(own, jnp.finfo(own.dtype).eps * jnp.max(own, initial=0.0))
+    return inverse, jnp.min(_ratio(diagonal**2, own, 0.0), initial=1.0)
 
 
 def apply(inverse: Inverse, f, gamma):
