@@ -87,6 +87,20 @@ def test_max_steps_keeps_the_part_computed():
     np.testing.assert_allclose(solution.q[reached], whole.q[reached], atol=1e-12)
 
 
+def test_every_step_saved_is_read_and_no_room_beyond():
+    """Rows that were never saved are no numbers, and parts of the rows give what all at once give."""
+    mechanism = pendulum()
+    state = lx.assemble(mechanism, {"pivot": 0.3})
+    steps = diffrax.SaveAt(t0=True, steps=True)
+    few, many = (lx.simulate(mechanism, state, t1=1.0, saveat=steps, max_steps=most) for most in (100, 1000))
+    saved = 1 + int(many.stats["num_accepted_steps"])
+    for found in (lambda run: run.q, lambda run: run.position("link", at="bob"), lx.Solution.energy):
+        of_few, of_many = found(few), found(many)
+        assert np.all(np.isfinite(of_many[:saved]))
+        assert not np.any(np.isfinite(of_many[saved:]))
+        np.testing.assert_allclose(of_many[:saved], of_few[:saved], rtol=1e-14)
+
+
 def test_a_state_that_does_not_close_is_refused():
     scene = SCENES["crank-slider"]
     mechanism = scene.mechanism(scene.settings(changes={"rod": 0.2}))

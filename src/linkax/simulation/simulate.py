@@ -21,6 +21,7 @@ from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.outset import Outset, depart
 from linkax.simulation.replay import Course, Steps, integrate, is_replayable
 from linkax.simulation.results import ENDED_WELL, RESULTS, SimulationError, result_name
+from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
 
@@ -117,7 +118,7 @@ def simulate(
         diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
         max_steps,
     )
-    solution = _read(mechanism, accuracy, outset, formulation, t0, found, _saves_states(saveat))
+    solution = _read(mechanism, accuracy, outset, formulation, found, _saves_states(saveat))
     if throw and all_known(solution):
         _raise_if_failed(solution, state)
     return solution
@@ -324,15 +325,16 @@ class _Integration(eqx.Module):
 
 
 @eqx.filter_jit
-def _read(mechanism, accuracy, outset, formulation, t0, found, states) -> Solution:
+def _read(mechanism, accuracy, outset, formulation, found, states) -> Solution:
     """The solution, what is saved put on the loops."""
     problem = _problem(mechanism, accuracy, outset, formulation)
     ts, ys, t_end, y_end, stats, result, closest, interpolation = found
     if states:
-        times = jnp.concatenate([jnp.where(jnp.isfinite(ts), ts, jnp.asarray(t0, ts.dtype)), t_end])
-        closed = jax.vmap(problem.close)(times, jnp.concatenate([ys, y_end]))
-        end, saved = State(closed.q[-1], closed.v[-1]), jnp.isfinite(ts)[:, None]
-        q, v, ys = jnp.where(saved, closed.q[:-1], jnp.inf), jnp.where(saved, closed.v[:-1], jnp.inf), None
+        # The end comes first, so that it is in the same part as times that were saved.
+        saved = jnp.concatenate([jnp.ones(1, bool), jnp.isfinite(ts)])
+        closed = over_rows(problem.close, saved, jnp.concatenate([t_end, ts]), jnp.concatenate([y_end, ys]))
+        end, later = State(closed.q[0], closed.v[0]), saved[1:, None]
+        q, v, ys = jnp.where(later, closed.q[1:], jnp.inf), jnp.where(later, closed.v[1:], jnp.inf), None
     else:
         q, v, end = None, None, problem.close(t_end[0], y_end[0])
     return Solution(

@@ -3,7 +3,6 @@
 from typing import Any, get_args
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -19,6 +18,7 @@ from linkax.simulation.instant import Instant, Power, Violation
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
+from linkax.simulation.rows import over_rows
 from linkax.simulation.state import State
 
 
@@ -274,7 +274,7 @@ def _over_times(function, solution, *details):
         tangent_space = solution.accuracy.method(solution.q.dtype, solution.rank_nearby)
         method = tangent_space if solution.formulation is None else solution.formulation
         of_time = lambda t, q, v: function(Instant(system, method, tangent_space, t, q, v), *details)
-        return jax.vmap(of_time)(solution.ts, solution.q, solution.v)
+        return over_rows(of_time, jnp.isfinite(solution.ts), solution.ts, solution.q, solution.v)
 
     for _ in range(solution.ts.ndim - 1):
         of_member = eqx.filter_vmap(of_member)
