@@ -1,4 +1,4 @@
-"""The step control alone, on steps that are made up."""
+"""The step control, on steps that are made up; and when implicit steps are given up."""
 
 from types import SimpleNamespace
 
@@ -138,3 +138,14 @@ def test_an_event_at_any_node_is_moved_between_nodes(solver):
         assert 0.0 < factor <= 1.0
         gaps = np.abs(np.array([0.0, *nodes]) - node / factor)
         assert np.min(gaps) >= 0.02, (node, factor)
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+def test_implicit_steps_go_on_while_they_converge(rtol):
+    """Steps are as long as their errors allow, though their equations take more than two iterations."""
+    link = lx.rod("link", 1.0, 1.0)
+    hinge = lx.Revolute("hinge", lx.GROUND, link.at("base"), axis="z")
+    mechanism = lx.Mechanism([link], [hinge], [lx.Gravity([0.0, -9.81, 0.0])])
+    state, accuracy = lx.assemble(mechanism, {"hinge": 0.3}), lx.Accuracy(rtol=rtol)
+    stats = lx.simulate(mechanism, state, t1=5.0, solver=diffrax.Kvaerno5(), accuracy=accuracy).stats
+    assert stats["num_rejected_steps"] < stats["num_accepted_steps"] / 4

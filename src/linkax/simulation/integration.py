@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -32,6 +33,7 @@ FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 SMALLEST_STEP_ULPS = 4.0
 MOST_RETRIES = 4
 FEASIBLE = 0.1  # of a step's first distance: what any step can keep from a passage
+DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
 BEYOND = 1.5  # how far after its end a step may leave a passage, in steps
 
 
@@ -135,6 +137,24 @@ class StageNorm(eqx.Module):
         return jnp.max(jnp.abs(jnp.concatenate([of_q, of_v])), initial=0.0)
 
 
+class Chord(diffrax.VeryChord):
+    """diffrax's root finder for implicit steps, which goes on for as long as it converges.
+
+    Up to version 0.7.2 diffrax's takes a step for failed where two iterations do not suffice.
+    """
+
+    def terminate(self, fn, y, args, options, state, tags):
+        """Whether what the iterations to come would still change is below kappa, or they diverge."""
+        rate, at_least_two = state.diffsize / state.diffsize_prev, state.step >= 2
+        contracts = at_least_two & (rate < 1.0)
+        to_come = state.diffsize * jnp.where(contracts, rate / jnp.where(contracts, 1.0 - rate, 1.0), 1.0)
+        failed = state.result != optx.RESULTS.successful
+        converged = to_come < self.kappa
+        diverged = at_least_two & jnp.logical_not(rate <= DIVERGES) & jnp.logical_not(converged)
+        result = optx.RESULTS.where(diverged & jnp.logical_not(failed), optx.RESULTS.nonlinear_divergence, state.result)
+        return failed | converged | diverged, result
+
+
 class Projected(diffrax.AbstractAdaptiveSolver):
     """Any diffrax solver, with the state put back on the closed loops after each step.
 
@@ -174,9 +194,11 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         """The solver for one step: its root finder measures what it finds as errors of the step are measured."""
         if self.tolerances is None:
             return self.solver
-        finder, norm = self.solver.root_finder, StageNorm(problem, y0, duration, self.tolerances)
-        finder = dataclasses.replace(finder, rtol=0.0, atol=1.0, norm=norm)
-        return dataclasses.replace(self.solver, root_finder=finder)
+        finder = self.solver.root_finder
+        if type(finder) is diffrax.VeryChord:
+            finder = Chord(0.0, 1.0, kappa=finder.kappa, linear_solver=finder.linear_solver)
+        norm = StageNorm(problem, y0, duration, self.tolerances)
+        return dataclasses.replace(self.solver, root_finder=dataclasses.replace(finder, rtol=0.0, atol=1.0, norm=norm))
 
     @property
     def interpolation_cls(self):
