@@ -1,11 +1,11 @@
-"""What the telescopic crane is compared with: a chain of beams."""
+"""What the telescopic crane is compared with: a chain of beams, rigid sections, the spectrum of a motion."""
 
 import jax.numpy as jnp
 import numpy as np
 
 import linkax as lx
 from linkax.scenes import SCENES
-from linkax.scenes.telescopic_crane import END, HEAD, SECTION, SHEAVE
+from linkax.scenes.telescopic_crane import END, FOOT, HEAD, SECTION, SHEAVE
 
 SCENE = SCENES["telescopic-crane"]
 
@@ -50,3 +50,51 @@ def chain_of_beams(parameters):
     x, real = moments(parameters["payload"] * across, density * across, tension)
     _, virtual = moments(1.0, 0.0 * density, 0.0)
     return np.sum(np.trapezoid(real * virtual, x, axis=1) / stiffness)
+
+
+def rigid(parameters):
+    """The crane, planar, with rigid sections in straight guides."""
+    flexible = SCENE.mechanism(parameters)
+    sections = []
+    for index in (1, 2, 3):
+        section = flexible.body(f"section_{index}").section
+        mass = float(section.linear_density) * SECTION
+        about = np.array([0.0, 1.0, 1.0]) * mass * SECTION**2 / 12.0
+        sections.append(
+            lx.RigidBody(f"section_{index}", mass, [SECTION / 2.0, 0.0, 0.0], about, {"tip": [SECTION, 0, 0]})
+        )
+    first, second, third = sections
+    turntable, payload = flexible.body("turntable"), flexible.body("payload")
+    above = lambda section, at: section.at([at, SHEAVE, 0.0])
+    slewing, luffing, telescoping, rope = flexible.constraints
+    joints = [
+        lx.Revolute("slew", lx.GROUND, turntable, axis="y"),
+        lx.Revolute("pivot", turntable, first, axis="z"),
+        lx.Prismatic("extension_2", first, second, axis="x"),
+        lx.Prismatic("extension_3", second, third, axis="x"),
+        lx.Revolute("hook", third.at("tip"), payload.at([0.0, parameters["hoist"], 0.0]), axis="z"),
+    ]
+    constraints = [
+        slewing,
+        lx.Rope("luffing", [turntable.at([*FOOT, 0.0]), first.at([HEAD, 0.0, 0.0])], luffing.length),
+        telescoping,
+        lx.Rope(rope.name, [above(first, SECTION - END), above(second, SECTION - END), above(third, END)], rope.length),
+    ]
+    return lx.Mechanism([turntable, *sections, payload], joints, flexible.forces[:1], constraints)
+
+
+def at_rest(mechanism, parameters):
+    """The rigid crane at the start."""
+    angle, extension = parameters["angle"], parameters["extension"]
+    guess = {"pivot": angle, "hook": -angle, "extension_2": extension, "extension_3": extension}
+    return lx.equilibrium(mechanism, lx.assemble(mechanism, guess=guess))
+
+
+def main_frequency(times, values):
+    """The strongest frequency [Hz] of values at equally spaced times: the peak of the spectrum, Hann's window."""
+    count = len(values)
+    spectrum = np.abs(np.fft.rfft((values - np.mean(values)) * np.hanning(count), 16 * count))
+    peak = np.argmax(spectrum)
+    left, top, right = np.log(spectrum[peak - 1 : peak + 2])
+    offset = (left - right) / (left - 2.0 * top + right) / 2.0
+    return (peak + offset) / (16 * count * (times[1] - times[0]))

@@ -1,11 +1,15 @@
-"""The telescopic crane against beam theory, and its balance of energy."""
+"""The telescopic crane against beam theory, rigid sections and its own linearisation, and its balance of energy."""
 
 import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from cranes import SCENE, chain_of_beams, deflection
+from cranes import SCENE, at_rest, chain_of_beams, deflection, main_frequency, rigid
 
 import linkax as lx
+
+REACH = 26.0  # of the boom [m]
 
 
 def crane(variant="release", **changes):
@@ -38,3 +42,50 @@ def test_energy_and_loops(variant, changes):
     work = np.cumsum((share[:-2:2] + 4.0 * share[1:-1:2] + share[2::2]) / 3.0)
     np.testing.assert_allclose(energy[2::2] - energy[0], work, atol=1e-6 * np.ptp(energy))
     assert found.worst_violation().position <= 1e-12
+
+
+@pytest.mark.slow
+def test_main_frequency_is_that_of_the_linearised_crane():
+    """After a fifth of the load drops; the first mode is the swinging of the load."""
+    _, mechanism, state = crane(payload=1600.0, dropped=400.0)
+    times = np.linspace(0.0, 6.0, 601)
+    found = lx.simulate(mechanism, state, t1=6.0, saveat=diffrax.SaveAt(ts=times), accuracy=lx.Accuracy(rtol=1e-6))
+    height = np.asarray(found.position("section_3", at="tip"))[:, 1]
+    modes = lx.linearise(mechanism, lx.equilibrium(mechanism, state)).natural_frequencies / (2.0 * np.pi)
+    np.testing.assert_allclose(main_frequency(times, height), modes[1], rtol=3e-3)
+
+
+@pytest.mark.slow
+def test_stiff_sections_move_like_rigid_ones():
+    parameters, mechanism, state = crane("luffing", modulus=2.1e16, duration=1.0)
+    guides = rigid(parameters)
+    begin = at_rest(guides, parameters)
+    options = {"t1": 1.0, "saveat": diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 21)), "accuracy": lx.Accuracy(rtol=1e-7)}
+    found, expected = (lx.simulate(m, s, **options) for m, s in ((mechanism, state), (guides, begin)))
+    for body, at in (("section_3", "tip"), ("payload", None)):
+        places = found.position(body, at=at), expected.position(body, at=at)
+        np.testing.assert_allclose(*places, atol=1e-6 * REACH)
+    for name in ("luffing", "telescoping", "extension_rope"):
+        np.testing.assert_allclose(found.reaction(name)[0], expected.reaction(name)[0], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_derivatives():
+    """Of the deflection, and of the main frequency, by height, modulus and load."""
+    parameters, _, near = crane()
+    names = ("height_2", "modulus", "payload")
+
+    @jax.jit
+    def found(numbers):
+        changed = parameters | dict(zip(names, numbers, strict=True))
+        mechanism = SCENE.mechanism(changed)
+        state = lx.equilibrium(mechanism, near)
+        modes = lx.linearise(mechanism, state, degrees_of_freedom=10)
+        return jnp.stack([deflection(mechanism, state, changed), modes.natural_frequencies[1]])
+
+    at = np.array([0.6, 2.1e11, 100.0])
+    slopes = jax.jit(jax.jacfwd(found))(at)
+    for column, value in enumerate(at):
+        step = 1e-4 * value * np.eye(3)[column]
+        difference = (found(at + step) - found(at - step)) / (2e-4 * value)
+        np.testing.assert_allclose(slopes[:, column], difference, rtol=1e-5)

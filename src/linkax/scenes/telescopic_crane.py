@@ -89,10 +89,10 @@ def _mechanism(parameters):
     boom = first, second, third = _boom(parameters)
     planar = parameters["planes"] == 1
 
-    def hinge(name, parent, child, cut=False):
+    def hinge(name, parent, child, cut=False, second_axis="y"):
         if planar:
             return lx.Revolute(name, parent, child, axis="z", cut=cut)
-        return lx.Universal(name, parent, child, axis="z", second_axis="y", cut=cut)
+        return lx.Universal(name, parent, child, axis="z", second_axis=second_axis, cut=cut)
 
     turntable = lx.RigidBody("turntable", 1e4, inertia=[2e4, 3e4, 2e4])
     payload = lx.point_mass("payload", parameters["payload"])
@@ -107,7 +107,7 @@ def _mechanism(parameters):
             lx.Revolute("pivot", turntable, first, axis="z"),
             *pads_2,
             *pads_3,
-            hinge("hook", third.at("tip"), payload.at([0.0, parameters["hoist"], 0.0])),
+            hinge("hook", third.at("tip"), payload.at([0.0, parameters["hoist"], 0.0]), second_axis="x"),
         ],
         [lx.Gravity([0.0, -parameters["gravity"], 0.0])],
         [
@@ -175,13 +175,14 @@ TELESCOPIC_CRANE = Scene(
         "slew_change": "what it turns [rad]",
         "angle": "of the boom from the horizontal, unbent, at the start [rad]",
         "angle_change": "what the luffing cylinder lifts it [rad]",
-        "extension": "of each section out of the one before, at the start [m]",
-        "extension_change": "what the telescoping cylinder and the rope push out each [m]",
+        "extension": "of each section out of the one before, at the start, less than 8 [m]",
+        "extension_change": "what the telescoping cylinder and the rope push out each, to less than 8 in all [m]",
     },
     variants={
         "release": Variant("the load drops", {"payload": 100.0, "dropped": 1900.0}),
         "luffing": Variant("lifted by 15 degrees", {"angle": math.pi / 4, "angle_change": math.pi / 12}, t1=10.0),
-        "telescoping": Variant("pushed out under load", {"extension": 4.0, "extension_change": 4.0}, t1=10.0),
+        "telescoping": Variant("pushed out under load", {"extension": 4.0, "extension_change": 3.0}, t1=10.0),
+        "slewing": Variant("turned by 45 degrees", {"planes": 2, "slew_change": math.pi / 4}, t1=10.0),
     },
     default_variant="release",
     t1=3.0,
