@@ -99,6 +99,8 @@ def test_every_step_saved_is_read_and_no_room_beyond():
         assert np.all(np.isfinite(of_many[:saved]))
         assert not np.any(np.isfinite(of_many[saved:]))
         np.testing.assert_allclose(of_many[:saved], of_few[:saved], rtol=1e-14)
+    assert jnp.issubdtype(many.rank().dtype, jnp.integer)
+    assert many.reaction_unique("pivot").force.dtype == bool
 
 
 def test_a_state_that_does_not_close_is_refused():

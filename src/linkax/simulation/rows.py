@@ -8,7 +8,7 @@ ROWS = 256  # evaluated at a time
 
 
 def over_rows(function, saved, *arrays):
-    """A function of each row of some arrays, not a number where the row was not saved.
+    """A function of each row of some arrays; not a number, zero or false where the row was not saved.
 
     Goes through the rows in parts. A part of which nothing was saved costs nothing, and one close
     to a singular configuration is no dearer for the others. Differentiable in both modes.
@@ -21,7 +21,7 @@ def over_rows(function, saved, *arrays):
         # A saved row stands in for others, whose infinite numbers would count as a singular configuration.
         stand_in = jnp.argmax(saved)
         found = jax.vmap(function)(*(jnp.where(across(array), array, array[stand_in]) for array in arrays))
-        return jax.tree.map(lambda array: jnp.where(across(array), array, jnp.nan), found)
+        return jax.tree.map(lambda array: jnp.where(across(array), array, _nothing(array)), found)
 
     count = len(saved)
     if count <= ROWS:
@@ -32,6 +32,10 @@ def over_rows(function, saved, *arrays):
     )
     given = tuple(map(split, (saved, *arrays)))
     shapes = jax.eval_shape(of_part, *(part[0] for part in given))
-    blank = jax.tree.map(lambda shape: jnp.full(shape.shape, jnp.nan, shape.dtype), shapes)
+    blank = jax.tree.map(lambda shape: jnp.broadcast_to(_nothing(shape), shape.shape), shapes)
     found = lax.map(lambda part: lax.cond(jnp.any(part[0]), lambda: of_part(*part), lambda: blank), given)
     return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:count], found)
+
+
+def _nothing(array):
+    return jnp.asarray(jnp.nan if jnp.issubdtype(array.dtype, jnp.inexact) else 0, array.dtype)
