@@ -18,6 +18,7 @@ from linkax.equations.coordinates import rates
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.joints.bending import OnBeam
 from linkax.model.mechanism import Mechanism
+from linkax.model.ropes import ElasticRope, Rope
 from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
 from linkax.simulation.solution import Solution
 
@@ -33,9 +34,9 @@ def animate_mechanism(solution: Solution, path, points=None, dpi: int = 100) -> 
     """Write an animated GIF of the mechanism, in the plane in which it moves most.
 
     Bodies are drawn through their joints and named frames, slides as boxes on their guides,
-    ground under the joints that rest on it, and point masses as discs. It has at most 150 frames,
-    25 a second, evenly over the run; where joints would turn too far from one frame to the next
-    to be followed, it shows the beginning of the run only.
+    ground under the joints that rest on it, ropes and struts as thin lines, and point masses as
+    discs. It has at most 150 frames, 25 a second, evenly over the run; where joints would turn too
+    far from one frame to the next to be followed, it shows the beginning of the run only.
 
     **Arguments:**
 
@@ -54,6 +55,7 @@ def animate_mechanism(solution: Solution, path, points=None, dpi: int = 100) -> 
         *_draw_slides(axes, scenery),
         *_draw_beams(axes, scenery),
         *_draw_bodies(axes, scenery),
+        *_draw_ropes(axes, scenery),
         *_draw_hinges(axes, scenery),
         *_draw_traces(axes, scenery),
         _draw_clock(axes, np.asarray(moments.ts)),
@@ -166,12 +168,21 @@ def _everything(poses, outlines, points):
 
 
 def _outline(mechanism, body) -> np.ndarray:
-    """Points of a body that joints and names mark; its centre of mass where there is none."""
-    frames = [frame for joint in mechanism.joints for frame in (joint.parent, joint.child) if frame.body == body]
-    marks = [np.asarray(frame.offset) for frame in frames]
+    """Points of a body that joints, ropes and names mark, and a mass that is concentrated."""
+    frames = [frame for joint in mechanism.joints for frame in (joint.parent, joint.child)]
+    frames += [point for rope in _ropes(mechanism) for point in rope.points]
+    marks = [np.asarray(frame.offset) for frame in frames if frame.body == body]
     if body != GROUND_NAME:
         marks += map(np.asarray, mechanism.body(body).frames.values())
+        if _is_concentrated(mechanism, mechanism.body(body)):
+            marks.append(np.asarray(mechanism.body(body).center_of_mass))
     return np.unique(np.array(marks), axis=0)
+
+
+def _ropes(mechanism):
+    return [
+        element for element in (*mechanism.constraints, *mechanism.forces) if isinstance(element, Rope | ElasticRope)
+    ]
 
 
 def _canvas(scenery, dpi):
@@ -288,12 +299,25 @@ def _draw_bodies(axes, scenery):
 def _draw_beams(axes, scenery):
     """Each beam as a thick line through its sections."""
     actors = []
-    for beam in scenery.mechanism.beams:
+    for place, beam in enumerate(scenery.mechanism.beams, start=1):
         way = np.stack([scenery.seen(section, np.zeros(3)) for section in beam.sections], axis=1)
-        colour = _colour(scenery.mechanism, beam.sections[0])
-        (line,) = axes.plot(*way[0].T, color=colour, linewidth=6.0, solid_capstyle="round", solid_joinstyle="round")
-        actors.append(_Actor(line, lambda index, line=line, way=way: line.set_data(*way[index].T)))
+        style = {"color": BODY_COLOURS[place % len(BODY_COLOURS)], "linewidth": 6.0}
+        actors.append(_draw_line(axes, way, style | {"solid_capstyle": "round", "solid_joinstyle": "round"}))
     return actors
+
+
+def _draw_ropes(axes, scenery):
+    """Each rope, or strut between two points, as a thin line."""
+    actors = []
+    for rope in _ropes(scenery.mechanism):
+        way = np.stack([scenery.seen(point.body, point.offset) for point in rope.points], axis=1)
+        actors.append(_draw_line(axes, way, {"color": INK, "linewidth": 1.5}))
+    return actors
+
+
+def _draw_line(axes, way, style):
+    (line,) = axes.plot(*way[0].T, **style)
+    return _Actor(line, lambda index: line.set_data(*way[index].T))
 
 
 def _draw_polygon(axes, corners, style):
@@ -303,7 +327,7 @@ def _draw_polygon(axes, corners, style):
 
 def _is_concentrated(mechanism, body):
     on_slide = any(_is_slide(joint) for joint in mechanism.joints if body.name in (joint.parent.body, joint.child.body))
-    return np.all(np.asarray(body.inertia) == 0.0) and not on_slide
+    return np.all(np.asarray(body.inertia) == 0.0) and body.mass > 0.0 and not on_slide
 
 
 def _hull(points):
