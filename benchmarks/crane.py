@@ -27,7 +27,17 @@ import linkax as lx
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from cranes import SCENE, at_rest, chain_of_beams, deflection, main_frequency, rigid
+from cranes import (
+    SCENE,
+    VARIED,
+    at_rest,
+    chain_of_beams,
+    crane,
+    deflection,
+    main_frequency,
+    rigid,
+    slopes_and_differences,
+)
 from parts import print_parts
 
 REACH = 26.0  # of the boom [m]
@@ -35,16 +45,8 @@ LOADS = (500.0, 1000.0, 2000.0, 3000.0, 4000.0)  # [kg]
 SHOWN = 6.0  # [s]
 SAMPLES = 1201
 STIFFER = (1e3, 1e5)  # than steel
-VARIED = {"height_2": 0.6, "modulus": 2.1e11, "payload": 100.0}
-DIFFERENCE = 1e-4  # relative
 LENGTHS = (0.5, 1.0, 2.0, 4.0)  # of motion [s]
 ELEMENTS = (1, 2, 4, 8)  # of each section
-
-
-def _crane(variant="release", **changes):
-    parameters = SCENE.settings(variant, changes)
-    mechanism = SCENE.mechanism(parameters)
-    return parameters, mechanism, SCENE.initial(mechanism, parameters)
 
 
 def statics(out):
@@ -52,7 +54,7 @@ def statics(out):
     for load in LOADS:
         row = {"load_kg": load}
         for name, gravity in (("small", 9.81e-3), ("full", 9.81)):
-            parameters, mechanism, state = _crane(payload=load, dropped=0.0, gravity=gravity)
+            parameters, mechanism, state = crane(payload=load, dropped=0.0, gravity=gravity)
             found, expected = float(deflection(mechanism, state, parameters)), float(chain_of_beams(parameters))
             row |= {f"{name}_m": f"{found:.6g}", f"{name}_off": f"{found / expected - 1.0:.1e}"}
         yield row
@@ -64,7 +66,7 @@ def figure_20(out):
     over_time, over_load = drawn.subplots(1, 2)
     frequencies = []
     for load in LOADS:
-        _, mechanism, state = _crane(payload=0.8 * load, dropped=0.2 * load)
+        _, mechanism, state = crane(payload=0.8 * load, dropped=0.2 * load)
         found = lx.simulate(mechanism, state, t1=SHOWN, saveat=diffrax.SaveAt(ts=times))
         height = np.asarray(found.position("section_3", at="tip"))[:, 1]
         # The first mode is the swinging of the load, the second the bending of the boom.
@@ -94,7 +96,7 @@ def stiff_sections(out):
     """Luffing in a second: places of tip and load, and forces at the start, against those of rigid sections."""
     times = diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 21))
     for stiffer in STIFFER:
-        parameters, mechanism, state = _crane("luffing", modulus=stiffer * 2.1e11, duration=1.0)
+        parameters, mechanism, state = crane("luffing", modulus=stiffer * 2.1e11, duration=1.0)
         guides = rigid(parameters)
         begin = at_rest(guides, parameters)
         found, expected = (lx.simulate(m, s, t1=1.0, saveat=times) for m, s in ((mechanism, state), (guides, begin)))
@@ -110,31 +112,18 @@ def stiff_sections(out):
 
 def derivatives(out):
     """In forward mode, through the rest of the crane and its modes."""
-    parameters, _, near = _crane()
-
-    @jax.jit
-    def found(numbers):
-        changed = parameters | dict(zip(VARIED, numbers, strict=True))
-        mechanism = SCENE.mechanism(changed)
-        state = lx.equilibrium(mechanism, near)
-        modes = lx.linearise(mechanism, state, degrees_of_freedom=10)
-        return jnp.stack([deflection(mechanism, state, changed), modes.natural_frequencies[1] / (2.0 * np.pi)])
-
-    at = np.array([*VARIED.values()])
-    slopes = jax.jit(jax.jacfwd(found))(at)
-    for column, (name, value) in enumerate(VARIED.items()):
-        step = DIFFERENCE * value * np.eye(len(at))[column]
-        difference = (found(at + step) - found(at - step)) / (2.0 * DIFFERENCE * value)
-        for row, what in enumerate(("deflection_m", "frequency_hz")):
-            slope = float(slopes[row, column])
-            yield {"of": what, "by": name, "slope": f"{slope:.6g}", "off": f"{difference[row] / slope - 1.0:.1e}"}
+    slopes, differences = slopes_and_differences()
+    off = differences / slopes - 1.0
+    for row, what in enumerate(("deflection_m", "frequency_hz")):
+        for column, name in enumerate(VARIED):
+            yield {"of": what, "by": name, "slope": f"{slopes[row, column]:.6g}", "off": f"{off[row, column]:.1e}"}
 
 
 def runs(out):
     """At the default accuracy; violations in radians and lengths of the mechanism."""
     out.mkdir(parents=True, exist_ok=True)
     for name in SCENE.variants:
-        _, mechanism, state = _crane(name)
+        _, mechanism, state = crane(name)
         t1 = SCENE.duration(name)
         times = np.linspace(0.0, t1, 401)
         began = time.perf_counter()
@@ -163,7 +152,7 @@ def cost(out):
     for what, values in (("elements", ELEMENTS), ("length_s", LENGTHS)):
         before = None
         for value in values:
-            _, mechanism, state = _crane(**{"elements": value} if what == "elements" else {})
+            _, mechanism, state = crane(**{"elements": value} if what == "elements" else {})
             t1 = 1.0 if what == "elements" else value
             run = lambda m=mechanism, s=state, t1=t1: jax.block_until_ready(
                 lx.simulate(m, s, t1=t1, saveat=diffrax.SaveAt(t1=True))

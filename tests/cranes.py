@@ -1,5 +1,6 @@
 """What the telescopic crane is compared with: a chain of beams, rigid sections, the spectrum of a motion."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -8,6 +9,15 @@ from linkax.scenes import SCENES
 from linkax.scenes.telescopic_crane import END, FOOT, HEAD, SECTION, SHEAVE
 
 SCENE = SCENES["telescopic-crane"]
+VARIED = {"height_2": 0.6, "modulus": 2.1e11, "payload": 100.0}
+DIFFERENCE = 1e-4  # relative
+
+
+def crane(variant="release", **changes):
+    """Parameters, mechanism and start."""
+    parameters = SCENE.settings(variant, changes)
+    mechanism = SCENE.mechanism(parameters)
+    return parameters, mechanism, SCENE.initial(mechanism, parameters)
 
 
 def deflection(mechanism, state, parameters):
@@ -88,6 +98,24 @@ def at_rest(mechanism, parameters):
     angle, extension = parameters["angle"], parameters["extension"]
     guess = {"pivot": angle, "hook": -angle, "extension_2": extension, "extension_3": extension}
     return lx.equilibrium(mechanism, lx.assemble(mechanism, guess=guess))
+
+
+def slopes_and_differences():
+    """Derivatives of deflection [m] and main frequency [Hz] by what is VARIED, (2, 3), and central differences."""
+    parameters, _, near = crane()
+
+    @jax.jit
+    def found(numbers):
+        changed = parameters | dict(zip(VARIED, numbers, strict=True))
+        mechanism = SCENE.mechanism(changed)
+        state = lx.equilibrium(mechanism, near)
+        modes = lx.linearise(mechanism, state, degrees_of_freedom=10)
+        return jnp.stack([deflection(mechanism, state, changed), modes.natural_frequencies[1] / (2.0 * jnp.pi)])
+
+    at = np.array([*VARIED.values()])
+    steps = DIFFERENCE * np.diag(at)
+    differences = [(found(at + step) - found(at - step)) / (2.0 * np.sum(step)) for step in steps]
+    return jax.jit(jax.jacfwd(found))(at), np.stack(differences, axis=1)
 
 
 def main_frequency(times, values):
