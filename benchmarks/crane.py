@@ -46,7 +46,7 @@ SHOWN = 6.0  # [s]
 SAMPLES = 1201
 STIFFER = (1e3, 1e5)  # than steel
 LENGTHS = (0.5, 1.0, 2.0, 4.0)  # of motion [s]
-ELEMENTS = (1, 2, 4, 8)  # of each section
+ELEMENTS = (1, 2, 4)  # of each section
 
 
 def statics(out):
