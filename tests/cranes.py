@@ -9,6 +9,7 @@ from linkax.scenes import SCENES
 from linkax.scenes.telescopic_crane import END, FOOT, HEAD, SECTION, SHEAVE
 
 SCENE = SCENES["telescopic-crane"]
+REACH = 26.0  # of the boom [m]
 VARIED = {"height_2": 0.6, "modulus": 2.1e11, "payload": 100.0}
 DIFFERENCE = 1e-4  # relative
 

@@ -3,11 +3,9 @@
 import diffrax
 import numpy as np
 import pytest
-from cranes import at_rest, chain_of_beams, crane, deflection, main_frequency, rigid, slopes_and_differences
+from cranes import REACH, at_rest, chain_of_beams, crane, deflection, main_frequency, rigid, slopes_and_differences
 
 import linkax as lx
-
-REACH = 26.0  # of the boom [m]
 
 
 def test_deflection_against_a_chain_of_beams():
