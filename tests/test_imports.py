@@ -8,8 +8,8 @@ import pytest
 import linkax
 
 SOURCE = Path(linkax.__file__).parent
-LAYERS = ["tracing", "spatial", "model", "linalg", "equations", "formulations", "simulation", "analysis", "studies"]
-LAYERS += ["scenes", "plotting", "cli"]
+LAYERS = ["compiler", "tracing", "spatial", "model", "linalg", "equations", "formulations", "simulation", "analysis"]
+LAYERS += ["studies", "scenes", "plotting", "cli"]
 
 
 def layer(module):

@@ -2,12 +2,16 @@
 
 Importing linkax switches JAX to double precision (`jax_enable_x64`): loops cannot be closed to
 rounding, nor singular configurations passed, in single precision. `simulate(dtype=jnp.float32)`
-computes in single precision all the same.
+computes in single precision all the same. It also adds to `XLA_FLAGS` what lets small mechanisms run fast on a CPU,
+see `linkax.compiler`; import linkax before JAX makes its first array.
 """
 
 import jax
 
+from linkax.compiler import set_flags
+
 jax.config.update("jax_enable_x64", True)
+set_flags()
 
 from linkax.analysis.inverse_dynamics import InverseDynamics as InverseDynamics  # noqa: E402
 from linkax.analysis.inverse_dynamics import inverse_dynamics as inverse_dynamics  # noqa: E402

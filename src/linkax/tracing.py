@@ -1,9 +1,9 @@
-"""Functions that JAX traces once, however often one program calls them.
+"""How JAX and XLA are to treat functions: traced once, computed in one kernel, differentiated whole.
 
 Before XLA compiles a simulation, JAX traces it in Python, which takes about as long. The same equations stand in
 several places of a program, and each transformation (`vmap`, `grad`) walks through all of it again, more than once
-where there are loops. Of a function marked here JAX keeps what it has found for each kind of arguments. XLA compiles
-it in place, so that it runs as fast as without the mark.
+where there are loops. Of a function marked `traced_once` JAX keeps what it has found for each kind of arguments. XLA
+compiles it in place, so that it runs as fast as without the mark.
 """
 
 from functools import partial
@@ -11,9 +11,51 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from linkax.compiler import makes_kernels_of_loops
+
 traced_once = eqx.filter_jit
+
+
+def in_one_kernel(function, sound, *args):
+    """function(*args), as one kernel of the CPU where that can be; no numbers where `sound` is false.
+
+    Of a program on the CPU XLA starts each of its operations by itself, which takes longer than one on a few
+    numbers. A loop it compiles as a whole, see `linkax.compiler`, and this is a loop that runs once. In a batch,
+    where one operation concerns many numbers, and on other devices it is no loop. Not to be differentiated backwards.
+    """
+    if not makes_kernels_of_loops():
+        return function(*args)
+    function = traced_once(function)
+    dynamic, static = eqx.partition(args, eqx.is_array)
+    shapes = eqx.filter_eval_shape(function, *args)
+    shapes, fixed = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+
+    def plain(sound, dynamic):
+        found = eqx.filter(function(*eqx.combine(dynamic, static)), eqx.is_array)
+        return jax.tree.map(lambda array, shape: lax.convert_element_type(array, shape.dtype), found, shapes)
+
+    def looping(sound, dynamic):
+        once = lambda carry: (jnp.zeros_like(sound), plain(sound, dynamic))
+        return lax.while_loop(lambda carry: carry[0], once, (sound, jax.tree.map(_undefined, shapes)))[1]
+
+    @jax.custom_batching.custom_vmap
+    def single(sound, dynamic):
+        return lax.platform_dependent(sound, dynamic, cpu=looping, default=plain)
+
+    @single.def_vmap
+    def _(_size, batched, sound, dynamic):
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
+        found = jax.vmap(plain, in_axes=tuple(axes))(sound, dynamic)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return eqx.combine(single(sound, dynamic), fixed)
+
+
+def _undefined(shape):
+    return jnp.full(shape.shape, jnp.nan if jnp.issubdtype(shape.dtype, jnp.inexact) else 0, shape.dtype)
 
 
 def differentiated_whole(function):

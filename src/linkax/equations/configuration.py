@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from linkax.equations.coordinates import by_speed
 from linkax.equations.system import System
+from linkax.linalg.placing import placed
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.forces import Load
@@ -180,7 +181,8 @@ def by_body(system: System, motions):
     topology = system.topology
     if np.array_equal(topology.moved_body, np.arange(topology.num_bodies)):
         return motions
-    return jnp.zeros((topology.num_bodies, 3), motions.dtype).at[topology.moved_body].add(motions)
+    onto = np.arange(topology.num_bodies)[:, None] == topology.moved_body
+    return jnp.asarray(onto, motions.dtype) @ motions
 
 
 def of_motions(topology, speeds):
@@ -192,8 +194,8 @@ def by_speed_of(topology, motions):
     """Sum what belongs to motions (…, n_m) for the speed that causes each: (…, n_v)."""
     if topology.motion_column is None:
         return motions
-    nothing = jnp.zeros((*motions.shape[:-1], topology.num_speeds), motions.dtype)
-    return nothing.at[..., topology.motion_column].add(motions)
+    onto = np.asarray(topology.motion_column)[:, None] == np.arange(topology.num_speeds)
+    return motions @ jnp.asarray(onto, motions.dtype)
 
 
 def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " n_v"]:
@@ -280,16 +282,15 @@ def _joint_motions(system, q):
         turn = jax.vmap(kind.motion.rotation)(q[kind.places])
         if kind.motion.angular_subspace_at is not None:
             turned = jax.vmap(kind.motion.angular_subspace_at)(q[kind.places])
-            angular = angular.at[_motions_of(topology, kind)].set(turned.reshape(-1, 3))
+            angular = placed(angular, _motions_of(topology, kind), turned)
         turns.append(turn)
         order += kind.bodies
     for kind, (turn, away, *subspace) in over_bending(_bent, system, lambda kind: (q[kind.places],)):
         motions, count = _motions_of(topology, kind), kind.places.shape[1]
         angular, linear = (
-            whole.at[motions].set(part[:, :count].reshape(-1, 3))
-            for whole, part in zip((angular, linear), subspace, strict=True)
+            placed(whole, motions, part[:, :count]) for whole, part in zip((angular, linear), subspace, strict=True)
         )
-        shift = shift.at[np.array(kind.bodies)].set(away)
+        shift = placed(shift, kind.bodies, away)
         turns.append(turn)
         order += kind.bodies
     turn = turns[0] if len(turns) == 1 else jnp.concatenate(turns)[np.argsort(order)]

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from linkax.linalg.placing import placed
 from linkax.model.topology import Topology
 from linkax.spatial.quaternions import conjugate, from_rotation_vector, multiply, normalised
 
@@ -16,6 +17,11 @@ def _places(topology):
     """Indices of quaternions in q, (n, 4), and of their angular velocities in v, (n, 3)."""
     starts = topology.quaternions
     return starts[:, :1] + np.arange(4), starts[:, 1:] + np.arange(3)
+
+
+def _of_plain(topology, v):
+    """Speeds (n_v,) at the places of their coordinates (n_q,), zero for quaternions."""
+    return placed(jnp.zeros(topology.num_coordinates, v.dtype), topology.plain[:, 0], v[topology.plain[:, 1]])
 
 
 def neutral(topology: Topology, dtype) -> Float[Array, " n_q"]:
@@ -31,7 +37,7 @@ def retract(topology: Topology, q, change) -> Float[Array, " n_q"]:
         return q + change
     in_q, in_v = _places(topology)
     turned = normalised(multiply(from_rotation_vector(change[in_v]), q[in_q]))
-    return q.at[topology.plain[:, 0]].add(change[topology.plain[:, 1]]).at[in_q].set(turned)
+    return placed(q + _of_plain(topology, change), in_q, turned)
 
 
 def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:
@@ -39,7 +45,7 @@ def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:
     if not len(topology.quaternions):
         return q
     in_q, _ = _places(topology)
-    return q.at[in_q].set(normalised(q[in_q]))
+    return placed(q, in_q, normalised(q[in_q]))
 
 
 def rates(topology: Topology, q, v) -> Float[Array, " n_q"]:
@@ -49,7 +55,7 @@ def rates(topology: Topology, q, v) -> Float[Array, " n_q"]:
     in_q, in_v = _places(topology)
     omega = v[in_v]
     turning = 0.5 * multiply(jnp.concatenate([jnp.zeros_like(omega[:, :1]), omega], axis=-1), q[in_q])
-    return jnp.zeros_like(q).at[topology.plain[:, 0]].set(v[topology.plain[:, 1]]).at[in_q].set(turning)
+    return placed(_of_plain(topology, v), in_q, turning)
 
 
 def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
@@ -58,12 +64,11 @@ def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
         return rates
     in_q, in_v = _places(topology)
     omega = 2.0 * multiply(rates[in_q], conjugate(q[in_q]))[:, 1:]
-    empty = jnp.zeros(topology.num_speeds, q.dtype)
-    return empty.at[topology.plain[:, 1]].set(rates[topology.plain[:, 0]]).at[in_v].set(omega)
+    return placed(by_speed(topology, rates), in_v, omega)
 
 
 def by_speed(topology: Topology, q) -> Float[Array, " n_v"]:
     """The coordinates at the places of their speeds, zero for those of quaternions."""
     if not len(topology.quaternions):
         return q
-    return jnp.zeros(topology.num_speeds, q.dtype).at[topology.plain[:, 1]].set(q[topology.plain[:, 0]])
+    return placed(jnp.zeros(topology.num_speeds, q.dtype), topology.plain[:, 1], q[topology.plain[:, 0]])

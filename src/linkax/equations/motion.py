@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from linkax.equations.configuration import Configuration, along_path, by_body, of_motions, over_bending
 from linkax.equations.system import System
+from linkax.linalg.placing import placed
 from linkax.model.bodies import Frame
 from linkax.model.forces import Load
 from linkax.model.terms import Term
@@ -164,7 +165,7 @@ def _scattered(topology, parts):
     if not parts:
         return None
     members, values = np.concatenate([np.array(bodies) for bodies in parts]), jnp.concatenate([*parts.values()])
-    return jnp.zeros((topology.num_bodies, 3), values.dtype).at[members].set(values)
+    return placed(jnp.zeros((topology.num_bodies, 3), values.dtype), members, values)
 
 
 def _turning(kind, coordinates, speeds):

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.linalg.placing import assembled
 from linkax.linalg.triangular import cholesky_inverse, cholesky_inverse_by_elimination, upper_inverse
 from linkax.spatial.vectors import length
 from linkax.tracing import traced_once
@@ -80,7 +81,7 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     # Undo the permutation and the scale of the rows, and the units of the speeds.
     chosen = order[:count]
     on_rows = jnp.where(active[:, None], upper_inverse(triangle), 0.0) * scale[chosen][:, None]
-    rows_inverse = jnp.zeros((rows, count), dtype).at[chosen].set(on_rows, unique_indices=True)
+    rows_inverse = (jnp.arange(rows)[:, None] == chosen).astype(dtype) @ on_rows
     basis = units[:, None] * (to_metric.T @ q)
     is_normal = jnp.zeros(n, bool).at[:count].set(active)
     tangent = jnp.where(is_normal, 0.0, basis)
@@ -167,27 +168,20 @@ def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) 
     if len(islands) == 1:
         found = invert(weight, jacobian, units, tolerance, None if rank_nearby is None else rank_nearby[0])
         return found._replace(rank=found.rank[None])
-    whole = Inverse(
-        tangent=jnp.zeros((n, n), dtype),
-        normal=jnp.zeros((n, m), dtype),
-        compliance=jnp.zeros((m, m), dtype),
-        basis=jnp.zeros((n, n), dtype),
-        rank=jnp.zeros(len(islands), int),
-        distance=jnp.ones((), dtype),
-        definiteness=jnp.ones((), dtype),
+    groups = list(_over_islands(invert, weight, jacobian, units, tolerance, islands, rank_nearby))
+    of_all = lambda part: jnp.concatenate([getattr(found, part) for *_, found in groups])
+    together = lambda shape, parts: assembled(
+        shape, [((down[:, :, None], across[:, None, :]), block) for down, across, block in parts], dtype
     )
-    for index, rows, columns, found in _over_islands(invert, weight, jacobian, units, tolerance, islands, rank_nearby):
-        across, down, up = columns[:, None, :], columns[:, :, None], rows[:, :, None]
-        whole = Inverse(
-            tangent=whole.tangent.at[down, across].set(found.tangent),
-            normal=whole.normal.at[down, rows[:, None, :]].set(found.normal),
-            compliance=whole.compliance.at[up, rows[:, None, :]].set(found.compliance),
-            basis=whole.basis.at[down, across].set(found.basis),
-            rank=whole.rank.at[index].set(found.rank),
-            distance=jnp.minimum(whole.distance, jnp.min(found.distance)),
-            definiteness=jnp.minimum(whole.definiteness, jnp.min(found.definiteness)),
-        )
-    return whole
+    return Inverse(
+        tangent=together((n, n), [(columns, columns, found.tangent) for _, _, columns, found in groups]),
+        normal=together((n, m), [(columns, rows, found.normal) for _, rows, columns, found in groups]),
+        compliance=together((m, m), [(rows, rows, found.compliance) for _, rows, _, found in groups]),
+        basis=together((n, n), [(columns, columns, found.basis) for _, _, columns, found in groups]),
+        rank=of_all("rank")[np.argsort(np.concatenate([index for index, *_ in groups]))],
+        distance=jnp.min(of_all("distance"), initial=1.0),
+        definiteness=jnp.min(of_all("definiteness"), initial=1.0),
+    )
 
 
 def _over_islands(function, weight, jacobian, units, tolerance, islands, rank_nearby):

@@ -74,7 +74,7 @@ def _for_batches(single, batched):
     def function(matrix):
         outer, shape = matrix.shape[:-2], matrix.shape[-2:]
         if not outer:
-            return single(matrix)
+            return (batched if shape[0] <= SMALL else single)(matrix)
         mapped = jax.vmap(batched if shape[0] <= SMALL else single)
         found = mapped(matrix.reshape(math.prod(outer), *shape))
         return jax.tree.map(lambda part: part.reshape(*outer, *part.shape[1:]), found)

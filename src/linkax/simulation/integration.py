@@ -7,6 +7,7 @@ rounding alone causes, and places steps so that no stage falls close to a singul
 """
 
 import dataclasses
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -24,6 +25,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.state import State
+from linkax.tracing import in_one_kernel
 
 NOISE_ULPS = 1.0
 SEEN_ULPS = 512.0  # of estimates: rounding changes larger ones by less than a hundredth
@@ -165,12 +167,15 @@ class Projected(diffrax.AbstractAdaptiveSolver):
     The solver's state holds the distance from a singular configuration at the end of the last
     step, and the smallest so far at any stage.
 
+    `is_final`: no transformation will differentiate its steps, so that each may be one kernel.
+
     Not an `AbstractWrappedSolver`: diffrax would look through it for fields it does not have.
     """
 
     solver: diffrax.AbstractSolver
     tolerances: tuple[Array, Array] | None
     after_step: bool = eqx.field(static=True)
+    is_final: bool = eqx.field(static=True)
 
     term_structure: ClassVar = diffrax.AbstractTerm
 
@@ -188,7 +193,7 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         # What is no number stands for the tolerances of the step control.
         lacks = finder is not None and not eqx.is_array_like(finder.rtol)
         tolerances = control.tolerances((accuracy.rtol, accuracy.atol)) if lacks else None
-        return Projected(solver, tolerances, accuracy.projection in ("both", "step"))
+        return Projected(solver, tolerances, accuracy.projection in ("both", "step"), control.is_final)
 
     def _stepping(self, problem, y0, duration):
         """The solver for one step: its root finder measures what it finds as errors of the step are measured."""
@@ -222,6 +227,12 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        step = Projected._step
+        if self.is_final:
+            step = partial(in_one_kernel, step, jnp.all(jnp.isfinite(y0)))
+        return step(self, terms, t0, t1, y0, args, solver_state, made_jump)
+
+    def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         inner, leaves, closest = solver_state
         # Solvers that begin with the last derivative of the step before must not where the state has moved since.
         made_jump = True if self.after_step and args.method.moves_after_steps else made_jump
@@ -278,12 +289,15 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     An adaptive step that has a stage close to a singular configuration is tried again, shorter,
     so that the configuration falls between two stages. Where a few tries do not help, or the step
     begins in the singular configuration, it is left as it is.
+
+    `is_final`: see `Projected`.
     """
 
     controller: diffrax.AbstractStepSizeController
+    is_final: bool = eqx.field(static=True, default=False)
 
     def wrap(self, direction):
-        return MechanismControl(self.controller.wrap(direction))
+        return MechanismControl(self.controller.wrap(direction), self.is_final)
 
     @property
     def is_adaptive(self) -> bool:
@@ -314,6 +328,14 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         return first, (state, jnp.zeros((), int))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        adapt = (
+            partial(in_one_kernel, MechanismControl._adapt, jnp.isfinite(t0))
+            if self.is_final
+            else MechanismControl._adapt
+        )
+        return adapt(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state)
+
+    def _adapt(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         units = args.system.units
         scales = tuple(_magnitudes(args.unpacked(y), units) for y in (y0, y1_candidate))
         scaled = None

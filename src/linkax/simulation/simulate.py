@@ -98,7 +98,7 @@ def simulate(
     replayed = adjoint is None and _saves_states(saveat) and is_replayable(solver, saveat, event, max_steps)
     if adjoint is None:
         adjoint = diffrax.ForwardMode() if replayed else diffrax.RecursiveCheckpointAdjoint()
-    control = MechanismControl(_traced_tolerances(stepsize_controller))
+    control = MechanismControl(_traced_tolerances(stepsize_controller), is_final=replayed)
     # Compiled apart, so that another solver, formulation or saveat compiles no more than it must.
     mechanism, accuracy, outset = _start(mechanism, state, t0, accuracy, dtype)
     found, formulation = _integrate(

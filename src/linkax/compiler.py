@@ -1,0 +1,44 @@
+"""What linkax asks of XLA, the compiler behind JAX.
+
+XLA makes a kernel of each operation that it cannot fuse with others, and on a CPU it takes some 50 ns to start one:
+longer than it runs, where a mechanism is small. A loop on few numbers XLA compiles into one kernel instead. What is
+few, and whether products of matrices are left to a library, which such a loop cannot call, are set by flags that
+it reads once in a process, when JAX makes its first array.
+"""
+
+import os
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+from jax import lax
+
+WHOLE_LOOP_BYTES = 2**20  # read and written by one pass of a loop: the caches of a core
+LOOPS = f"--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold={WHOLE_LOOP_BYTES}"
+PRODUCTS = "--xla_cpu_experimental_ynn_fusion_type="
+KNOWS_PRODUCTS = ("0.10",)  # a flag that XLA does not know ends the process
+
+
+def set_flags():
+    """Add to `XLA_FLAGS` what it does not name yet."""
+    flags = [LOOPS]
+    if jaxlib.__version__.startswith(KNOWS_PRODUCTS):
+        flags.append(PRODUCTS)
+    given = os.environ.get("XLA_FLAGS", "")
+    added = [flag for flag in flags if flag.partition("=")[0] not in given]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+
+
+@cache
+def makes_kernels_of_loops() -> bool:
+    """Whether XLA makes one kernel of a loop like those of `linkax.tracing.in_one_kernel`.
+
+    It does not where JAX had made an array before linkax was imported, where `XLA_FLAGS` say otherwise, and
+    in versions that know no such kernels.
+    """
+    with jax.ensure_compile_time_eval():
+        step = lambda carry: (carry[0] + 1, jnp.sin(carry[1] @ carry[1]))
+        loop = jax.jit(lambda count, matrix: lax.while_loop(lambda carry: carry[0] < 3, step, (count, matrix)))
+        program = loop.lower(0, jax.ShapeDtypeStruct((32, 32), jnp.float32)).compile().as_text()
+    return "xla_cpu_small_call" in program
