@@ -1,30 +1,34 @@
-"""A program for test_compiler: motions of scenes as JSON, compiled with the flags that linkax itself sets."""
+"""A program for test_compiler, compiled with the flags that linkax itself sets; prints JSON."""
 
 import json
-import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from known_answers import start
 
 import linkax as lx
 from linkax.compiler import makes_kernels_of_loops
+from linkax.tracing import in_one_kernel
 
 
-def motion(mechanism, state):
-    found = lx.simulate(mechanism, state, t1=0.5)
-    return {"v": np.asarray(found.v[-1]).tolist(), "steps": int(found.stats["num_steps"])}
+def motion():
+    """Speeds of a crank-slider after a while, and the steps to there."""
+    found = lx.simulate(*start("crank-slider", "SC4"), t1=0.5)
+    return {"speeds": np.asarray(found.v[-1]).tolist(), "steps": int(found.stats["num_steps"])}
 
 
-def main(scenes):
-    started = {scene: start(scene) for scene in scenes}
-    found = {scene: motion(*given) for scene, given in started.items()}
-    mechanism, state = started[scenes[0]]
-    speeds = jax.vmap(lambda q: lx.simulate(mechanism, lx.State(q, state.v), t1=0.5).v[-1])(
-        np.stack([state.q, state.q])
-    )
-    print(json.dumps({"kernels": makes_kernels_of_loops(), "motions": found, "batch": np.asarray(speeds).tolist()}))
+def kernels():
+    """A function of an array and a number that is none, alone, in a batch, and where it makes no sense."""
+    of = lambda sound, array: in_one_kernel(lambda array, count: (array @ array, count), sound, array, 3)
+    matrices = jnp.arange(32.0).reshape(2, 4, 4)
+    alone, count = jax.jit(of)(True, matrices[0])
+    batch, _ = jax.jit(jax.vmap(of, in_axes=(None, 0)))(True, matrices)
+    none, _ = jax.jit(of)(False, matrices[0])
+    loop = jax.jit(lambda array: of(True, array)[0]).lower(matrices[0]).as_text()
+    told = {"alone": alone, "count": count, "batch": batch, "none": none}
+    return {name: np.asarray(array).tolist() for name, array in told.items()} | {"loops": loop.count("while")}
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    print(json.dumps({"makes_kernels": makes_kernels_of_loops(), "motion": motion(), "kernels": kernels()}))

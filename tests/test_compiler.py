@@ -9,38 +9,36 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compiled_as_users_do import motion
-from known_answers import start
 
 from linkax.compiler import LOOPS, makes_kernels_of_loops, set_flags
 
-SCENES = ("crank-slider", "rigid-crane")  # a crank-slider; joints of many kinds, drives, springs
-
 
 @pytest.fixture(scope="module")
-def with_kernels():
+def as_users_do():
     environment = {name: text for name, text in os.environ.items() if name != "XLA_FLAGS"}
     program = Path(__file__).with_name("compiled_as_users_do.py")
-    done = subprocess.run(
-        [sys.executable, program, *SCENES], env=environment, capture_output=True, text=True, timeout=600, check=True
-    )
+    done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
 
 
-def test_importing_linkax_is_enough_for_kernels(with_kernels):
-    assert with_kernels["kernels"]
+def test_importing_linkax_is_enough_for_kernels(as_users_do):
+    assert as_users_do["makes_kernels"]
+    assert as_users_do["kernels"]["loops"] > 0
     assert not makes_kernels_of_loops()
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_kernels_change_nothing_but_rounding(with_kernels, scene):
-    one, other = with_kernels["motions"][scene], motion(*start(scene))
+def test_kernels_change_nothing_but_rounding(as_users_do):
+    one, other = as_users_do["motion"], motion()
     assert one["steps"] == other["steps"]
-    np.testing.assert_allclose(one["v"], other["v"], rtol=1e-10, atol=1e-10 * np.max(np.abs(other["v"])))
+    np.testing.assert_allclose(one["speeds"], other["speeds"], rtol=1e-10)
 
 
-def test_batches_run_without_kernels(with_kernels):
-    alone = with_kernels["motions"][SCENES[0]]["v"]
-    np.testing.assert_allclose(with_kernels["batch"], [alone, alone], rtol=1e-10, atol=1e-10)
+def test_a_function_in_a_kernel_is_the_same_function(as_users_do):
+    found, matrices = as_users_do["kernels"], np.arange(32.0).reshape(2, 4, 4)
+    np.testing.assert_allclose(found["alone"], matrices[0] @ matrices[0])
+    np.testing.assert_allclose(found["batch"], matrices @ matrices)
+    assert found["count"] == 3
+    assert np.all(np.isnan(found["none"]))
 
 
 def test_flags_that_are_given_stay(monkeypatch):
