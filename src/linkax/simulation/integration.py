@@ -302,15 +302,16 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     @property
     def is_adaptive(self) -> bool:
         """Whether the controller inside chooses the steps by their errors."""
-        return isinstance(self._innermost, diffrax.AbstractAdaptiveStepSizeController)
+        return isinstance(self.innermost, diffrax.AbstractAdaptiveStepSizeController)
 
     def tolerances(self, otherwise):
         """Relative and absolute tolerance of the controller inside; others where it has none."""
-        inner = self._innermost
+        inner = self.innermost
         return (inner.rtol, inner.atol) if self.is_adaptive else otherwise
 
     @property
-    def _innermost(self):
+    def innermost(self) -> diffrax.AbstractStepSizeController:
+        """The controller inside others that hold one."""
         inner = self.controller
         while hasattr(inner, "controller"):
             inner = inner.controller
@@ -344,7 +345,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             # The second is none where the step has led to no numbers.
             largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), *scales)
             # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
-            least = jnp.minimum(SEEN_ULPS * jnp.finfo(units.dtype).eps, SEEN * self._innermost.rtol)
+            least = jnp.minimum(SEEN_ULPS * jnp.finfo(units.dtype).eps, SEEN * self.innermost.rtol)
             scaled = tuple(
                 jnp.maximum(jnp.abs(_less(e / units, noise * scale)), least * scale)
                 for e, scale in zip(y_error.error, largest, strict=True)

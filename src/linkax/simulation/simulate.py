@@ -1,5 +1,6 @@
 """Integration of a mechanism's motion in time."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
@@ -27,6 +28,8 @@ from linkax.simulation.state import State
 
 DEFAULT_SAVES = 201
 DEFAULT_MAX_STEPS = 16**4
+FINEST = 1e-13  # tolerance, of a run that tells the error of another
+REFINED_STEPS = 4  # as many times as in the run before
 _SAVE_STATE = diffrax.SubSaveAt(t1=True).fn
 
 
@@ -119,9 +122,54 @@ def simulate(
         max_steps,
     )
     solution = _read(mechanism, accuracy, outset, formulation, found, _saves_states(saveat))
+    repeat = Repeat.of(state, t0, dt0, solver, stepsize_controller, max_steps)
+    solution = dataclasses.replace(solution, repeat=repeat)
     if throw and all_known(solution):
         _raise_if_failed(solution, state)
     return solution
+
+
+class Repeat(eqx.Module):
+    """What a run began with, to run it again; arrays, and what is none."""
+
+    arrays: Any
+    rest: Any = eqx.field(static=True)
+
+    @staticmethod
+    def of(*given) -> "Repeat":
+        """From state, t0, dt0, solver, step size controller and max_steps, as `simulate` takes them."""
+        given = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, given)
+        return Repeat(*eqx.partition(given, eqx.is_array))
+
+    def __call__(self, solution: Solution, factor) -> Solution:
+        """A run at `factor` times its tolerances, or at half its steps, saved at the same times."""
+        state, t0, dt0, solver, controller, max_steps = eqx.combine(self.arrays, self.rest)
+        accuracy = solution.accuracy
+        if isinstance(MechanismControl(controller).innermost, diffrax.ConstantStepSize) and dt0 is not None:
+            dt0 = 0.5 * dt0
+        elif not MechanismControl(controller).is_adaptive:
+            raise ValueError(f"steps of {type(controller).__name__} cannot be refined; use an adaptive controller")
+        controller, accuracy = _with_tolerances(lambda rtol: jnp.maximum(factor * rtol, FINEST), (controller, accuracy))
+        return simulate(
+            solution.mechanism,
+            state,
+            t0=t0,
+            t1=solution.t_end,
+            accuracy=accuracy,
+            formulation=solution.formulation,
+            saveat=diffrax.SaveAt(ts=jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)),
+            solver=solver,
+            stepsize_controller=controller,
+            dt0=dt0,
+            max_steps=REFINED_STEPS * max_steps,
+            throw=False,
+        )
+
+
+def _with_tolerances(change, tree):
+    """A pytree with all entries named rtol or atol changed."""
+    named = lambda path: path and getattr(path[-1], "name", None) in ("rtol", "atol")
+    return jax.tree_util.tree_map_with_path(lambda path, leaf: change(leaf) if named(path) else leaf, tree)
 
 
 def default_solver(mechanism: Mechanism) -> diffrax.AbstractSolver:
@@ -163,15 +211,14 @@ def _check_state(mechanism, state):
 def _traced_tolerances(controller):
     """Tolerances given as Python floats made arrays, so that another value compiles nothing anew."""
 
-    def replace(path, leaf):
-        named = path and getattr(path[-1], "name", None) in ("rtol", "atol")
-        if not (named and isinstance(leaf, (int, float))):
-            return leaf
-        if not (np.isfinite(leaf) and leaf >= 0.0):
-            raise ValueError(f"stepsize_controller: {path[-1].name} is {leaf}; it must be a positive, finite number")
-        return np.asarray(leaf, dtype=np.float64)
+    def traced(tolerance):
+        if not isinstance(tolerance, (int, float)):
+            return tolerance
+        if not (np.isfinite(tolerance) and tolerance >= 0.0):
+            raise ValueError(f"stepsize_controller: a tolerance is {tolerance}; it must be a positive, finite number")
+        return np.asarray(tolerance, dtype=np.float64)
 
-    return jax.tree_util.tree_map_with_path(replace, controller)
+    return _with_tolerances(traced, controller)
 
 
 class _OnManifold(eqx.Module):
