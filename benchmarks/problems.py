@@ -28,6 +28,7 @@ class Problem(NamedTuple):
 
     - `singular`: whether the motion passes singular configurations.
     - `cuts`: hinges for peers to cut, where linkax's choice suits them worse.
+    - `conserves`: whether no drive changes the energy. `for_peers`: whether it has hinges and slides only.
     """
 
     scene: str
@@ -35,6 +36,8 @@ class Problem(NamedTuple):
     point: str
     singular: bool
     cuts: tuple[str, ...] = ()
+    conserves: bool = True
+    for_peers: bool = True
 
     @property
     def name(self) -> str:
@@ -83,6 +86,10 @@ PROBLEMS = {
     "M2-40": Problem("n-four-bar", {"N": 40}, "B0", singular=True),
     # Cut in its middle, errors of MuJoCo grow fourfold and those of Pinocchio by many orders of magnitude.
     "M3": Problem("bricard", {}, "P3", singular=False, cuts=("P6",)),
+    "pendulum": Problem("pendulum", {}, "bob", singular=False, for_peers=False),
+    "spatial-four-link": Problem("spatial-four-link", {}, "C", singular=True, for_peers=False),
+    "planar-four-bar": Problem("planar-four-bar", {}, "P3", singular=False, for_peers=False),
+    "rigid-crane": Problem("rigid-crane", {}, "tip", singular=False, conserves=False, for_peers=False),
 }
 
 

@@ -1,111 +1,253 @@
-"""Error against cost: four tolerances, both metrics, every projection, three scenes.
+"""Error against cost over tolerances: solvers, projections, corrections, metrics, precisions, and other simulators.
 
-The presets of linkax are chosen from this table. `--json` prints one JSON object.
+One thing at a time differs from what linkax does by default. A row for each run: largest error of the tracked point
+[m], largest violations of positions and speeds (relative, see `linkax.Solution.worst_violation`), energy gained or lost
+over the largest kinetic energy, steps, evaluations of the equations, seconds to compile, milliseconds to run. Then for
+each target the cheapest run of linkax and of each peer. Times are of this machine, this run: compare ratios.
+
+The problems are ten seconds long; 201 positions are saved. The telescopic crane has a benchmark of its own.
 """
 
 import argparse
 import json
-import sys
+import os
+import platform
 import time
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import NamedTuple
 
+import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
-from known_answers import n_four_bar, reference
+from matplotlib.figure import Figure
 
 import linkax as lx
-from linkax.scenes import SCENES
+from benchmarks.peers import PEERS
+from benchmarks.peers.__main__ import rows as peer_rows
+from benchmarks.peers.runs import timed
+from benchmarks.problems import PROBLEMS, TIMES
+from linkax.simulation.files import written_whole
+from linkax.studies.comparison import evaluations
 
-TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-12)
-PROJECTIONS = ("both", "stage", "step", "none")
-METRICS = ("mass", "identity")
-REPEATS = 4
-LONG = 1.0  # seconds; such a run is timed once
-
-
-def slider(variant, t1):
-    known = reference(f"crank_slider_{variant}")
-    exact = known["x_slider"][known["t"] <= t1 + 1e-9]
-    return ("crank-slider", variant, t1, lambda found: found.position("slider")[:, 0] - exact)
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10, 1e-12)
+SINGLE = 1e-6  # smallest tolerance in single precision
+TARGETS = (1e-3, 1e-6, 1e-9)  # m
+PACKAGES = ("linkax", "jax", "jaxlib", "diffrax", "equinox", "numpy", "mujoco", "mujoco-mjx", "pin", "exudyn")
 
 
-def first_link(count, t1):
-    def error(found):
-        return found.position("link_0", at="tip")[:, :2] - n_four_bar(found.ts, count)
+class Choice(NamedTuple):
+    """What differs from the defaults: the option, its value, and by what it is given to linkax."""
 
-    return ("n-four-bar", "A02", t1, error)
+    option: str
+    value: str
+    solver: diffrax.AbstractSolver = diffrax.Dopri8()
+    projection: str = "both"
+    metric: str = "mass"
+    corrections: int = 1
+    dtype: type = jnp.float64
+
+    def options(self, rtol) -> dict:
+        """Of `linkax.simulate`."""
+        accuracy = lx.Accuracy(rtol=rtol, projection=self.projection, metric=self.metric)
+        method = accuracy.method(self.dtype)
+        method = lx.TangentSpace(method.rank_tolerance, metric=self.metric, corrections=self.corrections)
+        given = {} if self.corrections == 1 else {"formulation": method}
+        return {"accuracy": accuracy, "solver": self.solver, "dtype": self.dtype, **given}
 
 
-# Passes singular configurations; two loops at once; one that never meets any.
-RUNS = (slider("SC1", 5.0), first_link(2, 5.0), ("crank-slider", "regular", 1.0, None))
+DEFAULT = Choice("", "default")
+CHOICES = (
+    DEFAULT,
+    Choice("solver", "Tsit5", solver=diffrax.Tsit5()),
+    Choice("solver", "Dopri5", solver=diffrax.Dopri5()),
+    *(Choice("projection", name, projection=name) for name in ("stage", "step", "none")),
+    *(Choice("corrections", str(count), corrections=count) for count in (2, 3)),
+    Choice("metric", "identity", metric="identity"),
+    Choice("precision", "float32", dtype=jnp.float32),
+)
+OPTIONS = tuple(dict.fromkeys(choice.option for choice in CHOICES if choice.option))
+NOTHING = "nothing"
 
 
-def regular_error(found):
-    known = reference("crank_slider_torque")
-    at = np.searchsorted(known["t"], found.ts[-1] - 1e-9)
-    return found.joint("bearing")[-1] - known["theta"][at]
-
-
-def measure(name, variant, t1, error, rtol, metric, projection):
-    scene = SCENES[name]
-    settings = scene.settings(variant)
-    mechanism = scene.mechanism(settings)
-    state = scene.initial(mechanism, settings)
-    accuracy = lx.Accuracy(rtol=rtol, metric=metric, projection=projection)
+def measured(problem, choice, rtol, reference) -> dict:
+    """One run of one of `PROBLEMS`."""
+    mechanism, state = problem.start()
+    body, frame = problem.tracked
 
     def run():
-        began = time.perf_counter()
-        found = jax.block_until_ready(lx.simulate(mechanism, state, t1=t1, accuracy=accuracy, throw=False))
-        return found, time.perf_counter() - began
+        saveat = diffrax.SaveAt(ts=TIMES)
+        options = choice.options(rtol)
+        return jax.block_until_ready(lx.simulate(mechanism, state, t1=TIMES[-1], saveat=saveat, throw=False, **options))
 
-    found, first = run()
-    seconds = run()[1]
-    if seconds < LONG:
-        seconds = min(seconds, *(run()[1] for _ in range(REPEATS)))
-    energy, kinetic = np.asarray(found.energy()), np.asarray(found.kinetic_energy())
-    conserved = not settings.get("torque")
+    began = time.perf_counter()
+    run()
+    first = time.perf_counter() - began
+    found, seconds = timed(run)
+    apart = np.abs(np.asarray(found.position(body, at=frame)) - reference)
+    violation, energy = found.worst_violation(), np.asarray(found.energy())
+    steps = int(found.stats["num_steps"])
     return {
-        "scene": f"{name} {variant}",
-        "metric": metric,
-        "projection": projection,
         "rtol": rtol,
-        "error": float(np.max(np.abs((error or regular_error)(found)))),
-        "energy_error": float(np.max(np.abs(energy - energy[0])) / np.max(kinetic)) if conserved else None,
-        "steps": int(found.stats["num_steps"]),
-        "rejected": int(found.stats["num_rejected_steps"]),
-        "first_s": first,
+        "error": float(np.max(apart)) if np.all(np.isfinite(apart)) else None,
+        "position_violation": float(violation.position),
+        "speed_violation": float(violation.velocity),
+        "energy": float(np.ptp(energy) / np.max(found.kinetic_energy())) if problem.conserves else None,
+        "steps": steps,
+        "evaluations": evaluations(choice.solver, steps),
+        "compile_s": max(first - seconds, 0.0),
         "run_ms": 1e3 * seconds,
+        "result": lx.RESULTS[found.result],
     }
 
 
+def rows(key, options, peers) -> Iterator[dict]:
+    """One of `PROBLEMS`: by linkax with each choice, then by peers."""
+    problem = PROBLEMS[key]
+    reference = problem.reference()
+    for choice in CHOICES:
+        if choice.option and choice.option not in options:
+            continue
+        for rtol in TOLERANCES:
+            if choice.dtype == jnp.float64 or rtol >= SINGLE:
+                told = {"problem": key, "by": "linkax", "option": choice.option, "value": choice.value}
+                yield told | measured(problem, choice, rtol, reference)
+        jax.clear_caches()  # a process has room for the programs of a few mechanisms only
+    for row in peer_rows(key, peers) if peers and problem.for_peers else ():
+        if "method" in row:
+            yield _as_ours(row)
+
+
+def _as_ours(row):
+    """A peer's row in the terms of linkax's."""
+    ended = row.get("reached") == TIMES[-1]
+    return {
+        "problem": row["problem"],
+        "by": row["peer"],
+        "option": "method",
+        "value": row["method"],
+        "step": row["step"],
+        "error": row["error"] if ended else None,
+        "gap": row.get("gap"),
+        "run_ms": row["ms_per_second"] * TIMES[-1] if ended else None,
+        "result": row["note"],
+    }
+
+
+def cheapest(found: list[dict], key: str, by: str, target: float) -> dict | None:
+    """The run that took the least time of those with an error below a target [m]."""
+    good = [row for row in found if row["problem"] == key and row["by"] == by]
+    good = [row for row in good if row["error"] is not None and row["error"] < target]
+    return min(good, key=lambda row: row["run_ms"]) if good else None
+
+
+def summary(found: list[dict]) -> str:
+    """A table in Markdown: for each problem and target the cheapest runs, and how much longer the best peer takes."""
+    bys = list(dict.fromkeys(row["by"] for row in found))
+    lines = [f"| problem | error below | {' | '.join(bys)} | best peer over linkax |"]
+    lines.append("|---" * (len(bys) + 3) + "|")
+    for key in dict.fromkeys(row["problem"] for row in found):
+        for target in TARGETS:
+            best = {by: cheapest(found, key, by, target) for by in bys}
+            told = [f"{run['run_ms']:.3g} ms, {_setting(run)}" if run else "none" for run in best.values()]
+            others = [run["run_ms"] for by, run in best.items() if run and by != "linkax"]
+            ratio = f"{min(others) / best['linkax']['run_ms']:.1f}" if others and best["linkax"] else ""
+            lines.append(f"| {key} | {target:g} m | {' | '.join(told)} | {ratio} |")
+    return "\n".join(lines)
+
+
+def _setting(row):
+    return f"{row['value']} {row.get('rtol', row.get('step')):g}"
+
+
+def picture(found: list[dict], key: str) -> Figure:
+    """Error against run time of all that ran on a problem."""
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    panel = figure.subplots()
+    for by, option, value in dict.fromkeys((row["by"], row["option"], row["value"]) for row in found):
+        own = [row for row in found if (row["by"], row["option"], row["value"]) == (by, option, value)]
+        own = [row for row in own if row["error"] is not None]
+        ours = by == "linkax"
+        label = " ".join(filter(None, (by, option, value)))
+        times, errors = [row["run_ms"] for row in own], [max(row["error"], 1e-14) for row in own]
+        width = 2.5 if ours and not option else 1.0
+        panel.plot(times, errors, marker="o" if ours else "x", linewidth=width, markersize=4, label=label)
+    panel.set(xscale="log", yscale="log", xlabel="run time [ms]", ylabel="largest error [m]")
+    panel.set_title(f"{key}: {PROBLEMS[key].name}, {TIMES[-1]:g} s")
+    panel.grid(True, color="#E5E5E5")
+    figure.legend(loc="outside right upper", frameon=False, fontsize="small")
+    return figure
+
+
+def machine() -> dict:
+    """Processor, number of cores, and versions of the packages that are installed."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return {"processor": _processor(), "cores": os.cpu_count(), "python": platform.python_version(), **versions}
+
+
+def _processor():
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def _keys(text):
+    """Keys of `PROBLEMS` by a key, or by the name of a scene."""
+    keys = [key for key, problem in PROBLEMS.items() if text in (key, problem.scene)]
+    if not keys:
+        scenes = dict.fromkeys(problem.scene for problem in PROBLEMS.values())
+        raise argparse.ArgumentTypeError(f"unknown scene {text!r}; known: {', '.join([*scenes, *PROBLEMS])}")
+    return keys
+
+
+def _peers(text):
+    names = text.split(",")
+    unknown = [name for name in names if name not in PEERS]
+    if unknown:
+        raise argparse.ArgumentTypeError(f"unknown peer {unknown[0]!r}; known: {', '.join(PEERS)}")
+    return names
+
+
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true")
-    arguments = parser.parse_args()
-    rows = []
-    for run in RUNS:
-        for metric in METRICS:
-            for projection in PROJECTIONS:
-                for rtol in TOLERANCES:
-                    rows.append(measure(*run, rtol, metric, projection))
-                    if not arguments.json:
-                        print_row(rows[-1], len(rows) == 1)
-    if arguments.json:
-        print(json.dumps({"linkax": "0.1.0", "jax": jax.__version__, "rows": rows}))
-
-
-def print_row(row, heading):
-    if heading:
-        print(f"{'scene':22} {'metric':9} {'projection':10}", end=" ")
-        print(f"{'rtol':>7} {'error':>9} {'energy':>9} {'steps':>6} {'run ms':>8}")
-    print(
-        f"{row['scene']:22} {row['metric']:9} {row['projection']:10} {row['rtol']:7.0e} {row['error']:9.1e} "
-        f"{row['energy_error'] or np.nan:9.1e} {row['steps']:6d} {row['run_ms']:8.1f}",
-        flush=True,
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.work_precision",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("scenes", nargs="*", type=_keys, metavar="SCENE", help=f"or a key: {', '.join(PROBLEMS)}")
+    parser.add_argument("--peers", type=_peers, default=[], metavar="NAME,...", help=f"of {', '.join(PEERS)}")
+    parser.add_argument("--vary", choices=[*OPTIONS, NOTHING], action="append", help="what to vary; default: all")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write work_precision.json and a picture per problem")
+    arguments = parser.parse_args()
+    found = []
+    keys = dict.fromkeys(key for keys in arguments.scenes or [list(PROBLEMS)] for key in keys)
+    for key in keys:
+        for row in rows(key, arguments.vary or OPTIONS, arguments.peers):
+            found.append(row)
+            if not arguments.json:
+                print("  ".join(f"{name} {_short(entry)}" for name, entry in row.items()), flush=True)
+    told = {"machine": machine(), "rows": found}
+    if arguments.out:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        with written_whole(arguments.out / "work_precision.json") as path:
+            path.write_text(json.dumps(told, indent=1))
+        for key in keys:
+            with written_whole(arguments.out / f"{key}.png") as path:
+                picture([row for row in found if row["problem"] == key], key).savefig(path, dpi=110, format="png")
+    print(json.dumps(told) if arguments.json else f"\n{summary(found)}")
+
+
+def _short(entry):
+    return f"{entry:.3g}" if isinstance(entry, float) else entry
 
 
 if __name__ == "__main__":

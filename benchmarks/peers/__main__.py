@@ -65,14 +65,15 @@ def main():
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.peers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    known = ", ".join(PROBLEMS)
-    parser.add_argument("problems", nargs="*", type=problem_key, metavar="PROBLEM", help=f"default: all of {known}")
+    known = [key for key, problem in PROBLEMS.items() if problem.for_peers]
+    told = f"default: all of {', '.join(known)}"
+    parser.add_argument("problems", nargs="*", type=problem_key, metavar="PROBLEM", help=told)
     parser.add_argument("--peer", choices=list(PEERS), action="append", help="default: all")
     parser.add_argument("--target", type=float, default=1e-6, help="error of the cheapest runs [m], default 1e-6")
     parser.add_argument("--json", action="store_true", help="print one JSON array of rows, and nothing else")
     arguments = parser.parse_args()
     found = []
-    for problem in arguments.problems or PROBLEMS:
+    for problem in arguments.problems or known:
         if not arguments.json:
             print(f"\n{problem}: {PROBLEMS[problem].name}")
         for row in rows(problem, arguments.peer or PEERS):

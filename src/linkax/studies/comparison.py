@@ -215,7 +215,7 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
         acceleration_violation=float(worst.acceleration),
         energy_error=float(np.max(np.abs(energy), initial=0.0) / (kinetic if kinetic > 0.0 else 1.0)),
         steps=steps,
-        evaluations=_evaluations(stepping.solver, steps, getattr(found.formulation, "moves_after_steps", False)),
+        evaluations=evaluations(stepping.solver, steps, getattr(found.formulation, "moves_after_steps", False)),
         run_s=seconds,
         reached=float(found.t_end),
         verdict=verdict,
@@ -224,7 +224,7 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
     )
 
 
-def _evaluations(solver, steps, anew) -> int | None:
+def evaluations(solver, steps: int, anew: bool = False) -> int | None:
     """Evaluations of the equations of motion in so many Runge-Kutta steps; `anew`: that at the start of each too."""
     tableau = getattr(solver, "tableau", None)
     if tableau is None:
