@@ -20,6 +20,7 @@ from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.diagnosis import cause
 from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.outset import Outset, depart
+from linkax.simulation.repeat import Repeat, with_tolerances
 from linkax.simulation.replay import Course, Steps, integrate, is_replayable
 from linkax.simulation.results import ENDED_WELL, RESULTS, SimulationError, result_name
 from linkax.simulation.rows import over_rows
@@ -28,8 +29,6 @@ from linkax.simulation.state import State
 
 DEFAULT_SAVES = 201
 DEFAULT_MAX_STEPS = 16**4
-FINEST = 1e-13  # tolerance, of a run that tells the error of another
-REFINED_STEPS = 4  # as many times as in the run before
 _SAVE_STATE = diffrax.SubSaveAt(t1=True).fn
 
 
@@ -122,54 +121,11 @@ def simulate(
         max_steps,
     )
     solution = _read(mechanism, accuracy, outset, formulation, found, _saves_states(saveat))
-    repeat = Repeat.of(state, t0, dt0, solver, stepsize_controller, max_steps)
+    repeat = Repeat.of(simulate, state, t0, dt0, solver, stepsize_controller, max_steps)
     solution = dataclasses.replace(solution, repeat=repeat)
     if throw and all_known(solution):
         _raise_if_failed(solution, state)
     return solution
-
-
-class Repeat(eqx.Module):
-    """What a run began with, to run it again; arrays, and what is none."""
-
-    arrays: Any
-    rest: Any = eqx.field(static=True)
-
-    @staticmethod
-    def of(*given) -> "Repeat":
-        """From state, t0, dt0, solver, step size controller and max_steps, as `simulate` takes them."""
-        given = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, given)
-        return Repeat(*eqx.partition(given, eqx.is_array))
-
-    def __call__(self, solution: Solution, factor) -> Solution:
-        """A run at `factor` times its tolerances, or at half its steps, saved at the same times."""
-        state, t0, dt0, solver, controller, max_steps = eqx.combine(self.arrays, self.rest)
-        accuracy = solution.accuracy
-        if isinstance(MechanismControl(controller).innermost, diffrax.ConstantStepSize) and dt0 is not None:
-            dt0 = 0.5 * dt0
-        elif not MechanismControl(controller).is_adaptive:
-            raise ValueError(f"steps of {type(controller).__name__} cannot be refined; use an adaptive controller")
-        controller, accuracy = _with_tolerances(lambda rtol: jnp.maximum(factor * rtol, FINEST), (controller, accuracy))
-        return simulate(
-            solution.mechanism,
-            state,
-            t0=t0,
-            t1=solution.t_end,
-            accuracy=accuracy,
-            formulation=solution.formulation,
-            saveat=diffrax.SaveAt(ts=jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)),
-            solver=solver,
-            stepsize_controller=controller,
-            dt0=dt0,
-            max_steps=REFINED_STEPS * max_steps,
-            throw=False,
-        )
-
-
-def _with_tolerances(change, tree):
-    """A pytree with all entries named rtol or atol changed."""
-    named = lambda path: path and getattr(path[-1], "name", None) in ("rtol", "atol")
-    return jax.tree_util.tree_map_with_path(lambda path, leaf: change(leaf) if named(path) else leaf, tree)
 
 
 def default_solver(mechanism: Mechanism) -> diffrax.AbstractSolver:
@@ -218,7 +174,7 @@ def _traced_tolerances(controller):
             raise ValueError(f"stepsize_controller: a tolerance is {tolerance}; it must be a positive, finite number")
         return np.asarray(tolerance, dtype=np.float64)
 
-    return _with_tolerances(traced, controller)
+    return with_tolerances(traced, controller)
 
 
 class _OnManifold(eqx.Module):

@@ -1,0 +1,59 @@
+"""A run once more, more accurately, which tells how far off the first one is."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.simulation.integration import MechanismControl
+
+FINEST = 1e-13  # tolerance
+REFINED_STEPS = 4  # as many as in the run before
+
+
+class Repeat(eqx.Module):
+    """What a run began with, to run it again; arrays, and what is none."""
+
+    simulate: Callable = eqx.field(static=True)
+    arrays: Any
+    rest: Any = eqx.field(static=True)
+
+    @staticmethod
+    def of(simulate, *given) -> "Repeat":
+        """From `linkax.simulate`, and as it takes them: state, t0, dt0, solver, step size controller, max_steps."""
+        given = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, given)
+        return Repeat(simulate, *eqx.partition(given, eqx.is_array))
+
+    def __call__(self, solution, factor):
+        """A run at `factor` times its tolerances, or at half its steps, saved at the same times."""
+        state, t0, dt0, solver, controller, max_steps = eqx.combine(self.arrays, self.rest)
+        accuracy = solution.accuracy
+        if isinstance(MechanismControl(controller).innermost, diffrax.ConstantStepSize) and dt0 is not None:
+            dt0 = 0.5 * dt0
+        elif not MechanismControl(controller).is_adaptive:
+            raise ValueError(f"steps of {type(controller).__name__} cannot be refined; use an adaptive controller")
+        controller, accuracy = with_tolerances(lambda rtol: jnp.maximum(factor * rtol, FINEST), (controller, accuracy))
+        return self.simulate(
+            solution.mechanism,
+            state,
+            t0=t0,
+            t1=solution.t_end,
+            accuracy=accuracy,
+            formulation=solution.formulation,
+            saveat=diffrax.SaveAt(ts=jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)),
+            solver=solver,
+            stepsize_controller=controller,
+            dt0=dt0,
+            max_steps=REFINED_STEPS * max_steps,
+            throw=False,
+        )
+
+
+def with_tolerances(change, tree):
+    """A pytree with all entries named rtol or atol changed."""
+    named = lambda path: path and getattr(path[-1], "name", None) in ("rtol", "atol")
+    return jax.tree_util.tree_map_with_path(lambda path, leaf: change(leaf) if named(path) else leaf, tree)
