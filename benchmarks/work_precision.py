@@ -86,7 +86,7 @@ def measured(problem, choice, rtol, reference) -> dict:
     run()
     first = time.perf_counter() - began
     found, seconds = timed(run)
-    apart = np.abs(np.asarray(found.position(body, at=frame)) - reference)
+    apart = np.linalg.norm(np.asarray(found.position(body, at=frame)) - reference, axis=-1)
     violation, energy = found.worst_violation(), np.asarray(found.energy())
     steps = int(found.stats["num_steps"])
     return {
