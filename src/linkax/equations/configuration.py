@@ -1,7 +1,7 @@
 """Poses of all bodies by recursion along the tree, all bodies at once.
 
 Vectors are in ground axes. A sum along the way from ground to each body is a product with the
-topology's `path`; only orientations need products along the way (by pointer doubling).
+topology's `path`; orientations need products along the way (by pointer doubling).
 Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 4, gives the recursions.
 """
 
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from linkax.equations.coordinates import by_speed
 from linkax.equations.system import System
 from linkax.linalg.placing import placed
+from linkax.linalg.sparse_products import constant_product
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.forces import Load
@@ -164,16 +165,16 @@ def wrapped(angles, is_angle):
 
 def along_path(system: System, edges):
     """Sum over the tree joints from ground to each body: (n_b, …) to (n_b + 1, …)."""
-    flat = edges.reshape(edges.shape[0], -1)
-    total = jnp.asarray(system.topology.path, system.dtype) @ flat
-    return total.reshape(-1, *edges.shape[1:])
+    for doubling in system.topology.path_factors:
+        edges = constant_product(doubling, edges)
+    return jnp.concatenate([edges, jnp.zeros((1, *edges.shape[1:]), edges.dtype)])
 
 
 def over_subtree(system: System, bodies):
     """Sum over each body and all that it carries: (n_b, …) to (n_b, …)."""
-    flat = bodies.reshape(bodies.shape[0], -1)
-    total = jnp.asarray(system.topology.path[:-1].T, system.dtype) @ flat
-    return total.reshape(bodies.shape)
+    for doubling in system.topology.path_factors:
+        bodies = constant_product(doubling.T, bodies)
+    return bodies
 
 
 def by_body(system: System, motions):
@@ -182,7 +183,7 @@ def by_body(system: System, motions):
     if np.array_equal(topology.moved_body, np.arange(topology.num_bodies)):
         return motions
     onto = np.arange(topology.num_bodies)[:, None] == topology.moved_body
-    return jnp.asarray(onto, motions.dtype) @ motions
+    return constant_product(onto, motions)
 
 
 def of_motions(topology, speeds):
@@ -247,7 +248,7 @@ def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
 
     on_parent, on_child, cuts = bodies_of_cuts(topology)
     anchor = lambda body: system.anchor[np.where(topology.root[body] < 0, cuts, topology.root[body])]
-    around = jnp.asarray(topology.loop, system.dtype) @ link
+    around = constant_product(topology.loop, link)
     return Configuration(
         system=system,
         t=t,

@@ -11,8 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, along_speeds, by_body, by_speed_of, of_motions, over_subtree
+from linkax.equations.configuration import (
+    Configuration,
+    along_path,
+    along_speeds,
+    by_body,
+    by_speed_of,
+    of_motions,
+    over_subtree,
+)
 from linkax.equations.motion import Motion
+from linkax.linalg.sparse_products import constant_product, products_of_pairs
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
@@ -36,8 +45,7 @@ def _shifted(mass, first_moment, arm):
 def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
     """Mass matrix M of the tree by composite rigid bodies [kg m², kg m, kg]."""
     system, topology = configuration.system, configuration.system.topology
-    carrier = np.array(topology.predecessor)
-    above = lambda carried: _onto_carrier(carrier, carried)
+    above = lambda carried: _onto_carrier(np.array(topology.predecessor), carried)
     arm = configuration.center_of_mass()
     own_moment = system.mass[:, None] * arm
     nothing = jnp.zeros_like(arm)
@@ -52,16 +60,17 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
     at_body = at_anchor + cross(angular, position)
     momentum = mass[body][:, None] * at_body + cross(angular, first[body])
     moment = rotate(second[body], angular) + cross(first[body], at_body) + cross(position, momentum)
-    carried = angular @ moment.T + at_anchor @ momentum.T
     carries = topology.path[:-1][np.ix_(body, body)].T > 0.0
-    found = jnp.where(carries, carried, jnp.where(carries.T, carried.T, 0.0))
+    across, down = np.meshgrid(np.arange(len(body)), np.arange(len(body)))
+    carrier, carried = np.where(carries, down, np.where(carries.T, across, -1)), np.where(carries, across, down)
+    twist, wrench = jnp.concatenate([angular, at_anchor], axis=1), jnp.concatenate([moment, momentum], axis=1)
+    found = products_of_pairs(carrier, carried, twist, wrench)
     return found if topology.motion_column is None else by_speed_of(topology, by_speed_of(topology, found).T)
 
 
 def _onto_carrier(carrier, carried):
     """Sum (n_b, …) of the bodies that each body carries directly."""
-    onto = (carrier[None, :] == np.arange(len(carrier))[:, None]).astype(carried.dtype)
-    return (onto @ carried.reshape(len(carrier), -1)).reshape(carried.shape)
+    return constant_product(carrier[None, :] == np.arange(len(carrier))[:, None], carried)
 
 
 def applied_load(motion: Motion) -> Load:
@@ -117,9 +126,8 @@ def potential_energy(configuration: Configuration) -> Float[Array, ""]:
 def body_accelerations(motion: Motion, acceleration: Float[Array, " n_v"]):
     """Angular accelerations and accelerations of reference points at v̇, (n_b, 3) each."""
     configuration, system = motion.configuration, motion.system
-    path = jnp.asarray(system.topology.path[:-1], system.dtype)
     acceleration = of_motions(system.topology, acceleration)[:, None]
-    angular = path @ by_body(system, configuration.angular * acceleration)
-    at_anchor = path @ by_body(system, configuration.linear * acceleration)
+    angular = along_path(system, by_body(system, configuration.angular * acceleration))[:-1]
+    at_anchor = along_path(system, by_body(system, configuration.linear * acceleration))[:-1]
     linear = at_anchor + cross(angular, configuration.position[:-1])
     return motion.angular_bias[:-1] + angular, motion.bias[:-1] + linear

@@ -6,6 +6,7 @@ h₁ⁱ·s / ℓ, ℓ half the way around the loop. Some joint types combine sev
 last rows are constraints on coordinates of the tree and ropes, in radians and lengths of the mechanism.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from linkax.equations.configuration import Configuration, along_speeds, bodies_o
 from linkax.equations.coordinates import by_speed
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
+from linkax.linalg.sparse_products import constant_product, products_of_pairs
 from linkax.model.ropes import Rope
 from linkax.spatial.rotations import rotate, transpose
 from linkax.spatial.vectors import cross, dot
@@ -131,20 +133,23 @@ def immobile_residual(configuration: Configuration) -> Float[Array, " m_immobile
 def _jacobian(configuration: Configuration, rows: Rows):
     topology = configuration.system.topology
     parent, child, joints = bodies_of_cuts(topology)
-    loop = topology.loop[:, topology.moved_body]
-    turning = cross(rows.second, rows.first) @ configuration.angular.T
     # The twist of each joint at the point where the loop is cut, reached along its own side.
     on_child = configuration.position[child] + configuration.child_arm[joints]
     on_parent = configuration.position[parent] + configuration.parent_arm[joints] + configuration.separation
-    at, along = rows.translation_cut, rows.direction
-    swept = jnp.where(
-        loop[at] > 0.0,
-        cross(on_child[at], along) @ configuration.angular.T,
-        cross(on_parent[at], along) @ configuration.angular.T,
+    at, along, around = rows.translation_cut, rows.direction / rows.length[:, None], cross(rows.second, rows.first)
+    loop, count = topology.loop[:, topology.moved_body], len(rows.rotation_cut)
+    sign = np.concatenate([loop[rows.rotation_cut], loop[at]])
+    first = np.concatenate([np.arange(count), 2 * count + np.arange(len(at))])[:, None]
+    other = first + np.concatenate([np.full(count, count), np.full(len(at), len(at))])[:, None]
+    turning = jnp.concatenate([around, -around, cross(on_child[at], along), -cross(on_parent[at], along)])
+    moving = jnp.concatenate([jnp.zeros((2 * count, 3), along.dtype), along, -along])
+    found = products_of_pairs(
+        np.where(sign > 0.0, first, np.where(sign < 0.0, other, -1)),
+        np.broadcast_to(np.arange(sign.shape[1]), sign.shape),
+        jnp.concatenate([turning, moving], axis=1),
+        jnp.concatenate([configuration.angular, configuration.linear], axis=1),
     )
-    moving = (along @ configuration.linear.T + swept) / rows.length[:, None]
-    signs = jnp.asarray(np.concatenate([loop[rows.rotation_cut], loop[at]]), along.dtype)
-    return by_speed_of(topology, signs * jnp.concatenate([turning, moving]))
+    return by_speed_of(topology, found)
 
 
 def _combination(configuration: Configuration):
@@ -196,12 +201,12 @@ def _bias(motion: Motion, rows: Rows):
     configuration, topology = motion.configuration, motion.system.topology
     parent, child, joints = bodies_of_cuts(topology)
     separation = configuration.separation
-    loop = jnp.asarray(topology.loop, separation.dtype)
+    around = partial(constant_product, topology.loop)
     omega, alpha = motion.angular_velocity, motion.angular_bias
 
     at = rows.rotation_cut
-    turning = (loop @ motion.edge_turn)[at]
-    turning_bias = (loop @ motion.edge_angular_bias)[at]
+    turning = around(motion.edge_turn)[at]
+    turning_bias = around(motion.edge_angular_bias)[at]
     second_rate, first_rate = cross(omega[child[at]], rows.second), cross(omega[parent[at]], rows.first)
     normal = cross(rows.second, rows.first)
     normal_rate = cross(second_rate, rows.first) + cross(rows.second, first_rate)
@@ -214,8 +219,8 @@ def _bias(motion: Motion, rows: Rows):
         return cross(alpha[bodies], arms) + cross(omega[bodies], arm_rate(bodies, arms))
 
     parent_arm, child_arm = configuration.parent_arm[joints], configuration.child_arm[joints]
-    rate = loop @ motion.edge_rate + arm_rate(child, child_arm) - arm_rate(parent, parent_arm)
-    acceleration = loop @ motion.edge_bias + arm_bias(child, child_arm) - arm_bias(parent, parent_arm)
+    rate = around(motion.edge_rate) + arm_rate(child, child_arm) - arm_rate(parent, parent_arm)
+    acceleration = around(motion.edge_bias) + arm_bias(child, child_arm) - arm_bias(parent, parent_arm)
     # Seen from the parent: Coriolis and the parent's own turning taken off.
     seen = acceleration - 2.0 * cross(omega[parent], rate) - cross(alpha[parent], separation)
     seen = seen + cross(omega[parent], cross(omega[parent], separation))
