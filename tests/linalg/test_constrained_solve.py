@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from linkax.linalg.constrained_solve import (
-    apply,
     constrained_solve,
     invert,
     invert_apart,
@@ -177,7 +176,7 @@ def test_without_independent_rows_nothing_is_constrained():
         inverse = invert(mass, np.zeros((rows, 3)), UNITS[3], TOLERANCE)
         assert int(inverse.rank) == 0
         assert float(inverse.distance) == 1.0
-        a, multipliers = apply(inverse, np.ones(3), np.zeros(rows))
+        a, multipliers = inverse.apply(np.ones(3), np.zeros(rows))
         np.testing.assert_allclose(a, 1.0 / np.diagonal(mass), rtol=1e-15)
         np.testing.assert_array_equal(multipliers, np.zeros(rows))
 

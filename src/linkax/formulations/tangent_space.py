@@ -23,6 +23,7 @@ from linkax.formulations.branches import Crossing
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
 from linkax.formulations.linearised import Changes, Moved, moved, unbalanced
 from linkax.formulations.passage import Course, Value, limit
+from linkax.linalg.chained_inverse import ChainedInverse, invert_chain
 from linkax.linalg.constrained_solve import (
     Inverse,
     constrained_solve,
@@ -34,6 +35,7 @@ from linkax.tracing import traced_once
 
 ROUNDING_ULPS = 8.0
 MOST_CORRECTIONS = 20
+ALONG = (1e-4, 1e-3, 1e-2)  # radians or lengths of the mechanism, along which ranks of cells show
 
 
 class Departure(NamedTuple):
@@ -56,8 +58,9 @@ class TangentSpace(AbstractFormulation):
     """Corrections, accelerations and multipliers by the split of the space of speeds.
 
     - `rank_tolerance`: τ; a loop row is independent where |R_kk| > τ max(|R₁₁|, 1).
-    - `rank_nearby`: rank of each island (see `linkax.model.topology.Topology`) along the motion,
-      where it is known; in a singular configuration the rank itself is smaller.
+    - `rank_nearby`: rank of each island (see `linkax.model.topology.Topology`), or of each cell of its
+      chain where it has one, along the motion, where it is known; in a singular configuration the rank
+      itself is smaller.
     - `metric`: in which corrections are smallest and normal and tangent space orthogonal:
       "mass" (W = M + JᵀDJ) or "identity" (radians, and lengths of the mechanism).
     - `corrections`: position corrections in each evaluation and after each step.
@@ -84,15 +87,42 @@ class TangentSpace(AbstractFormulation):
             return instant.mass
         return jnp.diag(instant.configuration.system.units**-2)
 
-    def _split(self, instant: Coefficients) -> Inverse:
+    def _ranks_of_islands(self, topology):
+        """`rank_nearby` of the islands."""
+        if topology.chain is None or self.rank_nearby is None:
+            return self.rank_nearby
+        return jnp.asarray(topology.cells_of_islands, int) @ self.rank_nearby
+
+    def _split_at_once(self, instant: Coefficients) -> Inverse:
+        """The split with a basis of the tangent space."""
         weight = instant.mass if self.metric == "mass" else None
         system = instant.configuration.system
-        islands = system.topology.islands
-        return invert_apart(weight, instant.jacobian, system.units, self.rank_tolerance, islands, self.rank_nearby)
+        islands, ranks = system.topology.islands, self._ranks_of_islands(system.topology)
+        return invert_apart(weight, instant.jacobian, system.units, self.rank_tolerance, islands, ranks)
+
+    def _split(self, instant: Coefficients) -> Inverse | ChainedInverse:
+        """The split as it is found soonest."""
+        if instant.configuration.system.topology.chain is None:
+            return self._split_at_once(instant)
+        return self._chained(instant, instant.mass if self.metric == "mass" else None)
+
+    def _chained(self, instant: Coefficients, weight) -> ChainedInverse:
+        system = instant.configuration.system
+        return invert_chain(
+            weight, instant.jacobian, system.units, self.rank_tolerance, system.topology.chain, self.rank_nearby
+        )
+
+    def _for_dynamics(self, split, instant: Coefficients):
+        """The inverse with M, for the same split."""
+        if self.metric == "mass":
+            return split
+        if isinstance(split, ChainedInverse):
+            return self._chained(instant, instant.mass)
+        return with_mass(split, instant.mass)
 
     def _solve(self, split, instant, f, gamma, sweeps):
         """v̇ and λ of M v̇ = f + Jᵀλ, J v̇ = γ."""
-        inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
+        inverse = self._for_dynamics(split, instant)
         return constrained_solve(inverse, instant.mass, instant.jacobian, f, gamma, sweeps)
 
     def _on_velocity_level(self, instant, v, split, sweeps):
@@ -106,6 +136,13 @@ class TangentSpace(AbstractFormulation):
         weight = self._weight(instant)
         still = jnp.zeros(weight.shape[0], weight.dtype)
         return constrained_solve(split, weight, instant.jacobian, still, rows, sweeps)[0]
+
+    def _in_tangent_space(self, instant, split, change):
+        """The part of a change that keeps the loops closed."""
+        weight = self._weight(instant)
+        along, _ = split.apply(weight @ change, jnp.zeros(instant.jacobian.shape[0], change.dtype))
+        # The factors are those of the state before its correction.
+        return along - split.apply(jnp.zeros_like(change), instant.jacobian @ along)[0]
 
     def _approximated(self, system, t, q, v):
         """One factorisation, at q; then a fixed number of corrections with it."""
@@ -142,11 +179,9 @@ class TangentSpace(AbstractFormulation):
         q, v, split = _corrected((self, system, t, q, v))
         if errors:
             instant = lax.stop_gradient(coefficients(system, t, q))
-            remaining = split.tangent @ (self._weight(instant) @ jnp.stack(errors, axis=1))
-            # The factors are those of the state before its correction.
-            remaining = remaining - split.normal @ (instant.jacobian @ remaining)
+            in_q, in_v = jax.vmap(lambda error: self._in_tangent_space(instant, split, error))(jnp.stack(errors))
             open_ = _largest(residual(instant.configuration)) * system.units
-            errors = jnp.where(jnp.abs(remaining[:, 0]) < open_, open_, remaining[:, 0]), remaining[:, 1]
+            errors = jnp.where(jnp.abs(in_q) < open_, open_, in_q), in_v
         return q, v, errors, split.distance
 
     @traced_once
@@ -158,25 +193,45 @@ class TangentSpace(AbstractFormulation):
     def crossing(self, system: System, t, q) -> Crossing:
         """The configuration as a crossing of branches."""
         instant = coefficients(system, t, q)
-        return Crossing(instant.configuration, instant.jacobian, self._split(instant))
+        return Crossing(instant.configuration, instant.jacobian, self._split_at_once(instant))
 
     def distance(self, system: System, t, q) -> Float[Array, ""]:
         """The distance d from the nearest singular configuration, with derivatives."""
         instant = coefficients(system, t, q)
         weight = instant.mass if self.metric == "mass" else None
-        return singularity_distance(
-            weight, instant.jacobian, system.units, self.rank_tolerance, system.topology.islands, self.rank_nearby
-        )
+        islands, ranks = system.topology.islands, self._ranks_of_islands(system.topology)
+        return singularity_distance(weight, instant.jacobian, system.units, self.rank_tolerance, islands, ranks)
 
     def departure(self, system: System, t, q) -> "Departure":
         """What decides where a motion from rest goes."""
         instant = coefficients(system, t, q)
-        split, rest = self._split(instant), jnp.zeros(system.topology.num_speeds, system.dtype)
-        inverse = split if self.metric == "mass" else with_mass(split, instant.mass)
+        split, rest = self._split_at_once(instant), jnp.zeros(system.topology.num_speeds, system.dtype)
+        inverse = self._for_dynamics(split, instant)
         motion = move(instant.configuration, rest)
-        acceleration = inverse.tangent @ generalised_force(motion) + inverse.normal @ gamma(motion)
+        acceleration, _ = inverse.apply(generalised_force(motion), gamma(motion))
         crossing = Crossing(instant.configuration, instant.jacobian, split)
         return Departure(crossing, instant.mass, acceleration, inverse.definiteness)
+
+    def ranks_along(self, system: System, t, q, v, rank) -> Int[Array, " k"]:
+        """`rank_nearby` along motion from here with speeds v, of any size, where `rank` is that of each island.
+
+        That of cells shows at states a little farther on. Where it does not add up there, a cell has as many
+        independent rows as the tolerance says.
+        """
+        topology = system.topology
+        if topology.chain is None:
+            return rank
+        fastest = jnp.max(jnp.abs(v / system.units))
+        duration = jnp.where(fastest > 0.0, 1.0 / jnp.where(fastest > 0.0, fastest, 1.0), 0.0)
+
+        def found(place):
+            later = t + place * duration if is_driven(system) else t
+            closed, _, _ = self._approach(system, later, retract(topology, q, place * duration * v), v)
+            return self._split(coefficients(system, later, closed)).rank
+
+        ranks = jnp.max(lax.map(found, jnp.asarray(ALONG, q.dtype)), axis=0)
+        adds_up = jnp.all(jnp.asarray(topology.cells_of_islands, int) @ ranks == rank)
+        return jnp.where(adds_up, ranks, topology.chain.most_independent)
 
     @traced_once
     def dynamics(self, system: System, t, q, v) -> Dynamics:
@@ -235,7 +290,7 @@ class _Evaluated(NamedTuple):
     v: Float[Array, " n_v"]
     acceleration: Float[Array, " n_v"]
     multipliers: Float[Array, " m"]
-    split: Inverse
+    split: Inverse | ChainedInverse
 
 
 def _constant(tree):

@@ -6,6 +6,7 @@ it follow the four blocks of the saddle-point system's inverse, a = T f + G γ, 
 which serve accelerations and corrections alike.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -42,6 +43,21 @@ class Inverse(NamedTuple):
     distance: Float[Array, ""]
     definiteness: Float[Array, ""]
 
+    def apply(self, f, gamma):
+        """(a, λ) for the system that was inverted."""
+        a = self.tangent @ f + self.normal @ gamma
+        return a, self.compliance @ gamma - self.normal.T @ f
+
+    def product(self, mass, jacobian):
+        """[[M, -Jᵀ], [J, 0]] of a system nearby, as a function of (a, λ) in one vector."""
+        return lambda unknowns: saddle_point_product(mass, jacobian, unknowns)
+
+
+def saddle_point_product(mass, jacobian, unknowns):
+    """[[M, -Jᵀ], [J, 0]] times (a, λ)."""
+    a, multipliers = jnp.split(unknowns, [mass.shape[0]])
+    return jnp.concatenate([mass @ a - jacobian.T @ multipliers, jacobian @ a])
+
 
 @traced_once
 def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
@@ -75,7 +91,7 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     weighted, scale = _scaled(to_metric, jacobian)
     q, r, order = pivoted_qr(weighted)
     count = min(n, rows)
-    active, distance = _independent(r, tolerance, rank_nearby)
+    active, distance = independent(r, tolerance, rank_nearby)
     identity = jnp.eye(count, dtype=dtype)
     triangle = jnp.where(active[:, None] & active[None, :], r[:, :count][:count], identity)
     # Undo the permutation and the scale of the rows, and the units of the speeds.
@@ -104,27 +120,31 @@ def _metric(weight, jacobian, units, tolerance):
     moved = jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1)
     # A row that moves massless bodies alone takes the largest mass that there is.
     moved = jnp.where(moved > 0.0, moved, jnp.max(jnp.diagonal(weight), initial=0.0) * size**2)
-    added = _ratio(moved, square, 0.0)
+    added = ratio(moved, square, 0.0)
     return weight + (jacobian.T * added) @ jacobian, added
 
 
 def _scaled(to_metric, jacobian):
     """Rows of J as columns in the metric, each as long as it is in units, and by how much it was scaled."""
     weighted = to_metric @ jacobian.T
-    scale = _ratio(length(jacobian), length(weighted, axis=0), 1.0)
+    scale = ratio(length(jacobian), length(weighted, axis=0), 1.0)
     return weighted * scale, scale
 
 
-def _independent(r, tolerance, rank_nearby):
-    """Which rows count as independent, of those chosen in order, and the distance d."""
+def independent(r, tolerance, rank_nearby, largest=None):
+    """Which rows count as independent, of those chosen in order, and the distance d.
+
+    `largest`: |R₁₁| of the whole, where `r` is that of a part.
+    """
     diagonal = jnp.abs(jnp.diagonal(r))
+    largest = diagonal[0] if largest is None else largest
     places = jnp.arange(len(diagonal))
-    active = diagonal > tolerance * jnp.maximum(diagonal[0], 1.0)
+    active = diagonal > tolerance * jnp.maximum(largest, 1.0)
     if rank_nearby is not None:
         active = active & (places < rank_nearby)
     last = (jnp.sum(active) if rank_nearby is None else rank_nearby) - 1
     smallest = jnp.sum(jnp.where(places == last, diagonal, 0.0))
-    return active, jnp.where(last >= 0, _ratio(smallest, diagonal[0], 0.0), 1.0)
+    return active, jnp.where(last >= 0, ratio(smallest, largest, 0.0), 1.0)
 
 
 def singularity_distance(weight, jacobian, units, tolerance, islands, rank_nearby=None) -> Float[Array, ""]:
@@ -142,7 +162,7 @@ def _distance(weight, jacobian, units, tolerance, rank_nearby):
         to_metric, _ = cholesky_inverse_by_elimination(_metric(weight, jacobian, units, tolerance)[0])
     weighted, _ = _scaled(to_metric, jacobian)
     _, r, order = pivoted_qr(lax.stop_gradient(weighted))
-    active, found = _independent(r, tolerance, rank_nearby)
+    active, found = independent(r, tolerance, rank_nearby)
     columns = weighted[:, order[: len(active)]]
 
     def orthogonalise(k, carry):
@@ -214,7 +234,7 @@ def with_mass(inverse: Inverse, mass) -> Inverse:
     return inverse._replace(tangent=tangent, normal=normal, compliance=compliance, definiteness=definiteness)
 
 
-def _ratio(a, b, otherwise):
+def ratio(a, b, otherwise):
     return jnp.where(b > 0.0, a / jnp.where(b > 0.0, b, 1.0), otherwise)
 
 
@@ -224,13 +244,7 @@ def _lower_inverse(matrix):
     own = jnp.diagonal(matrix)
     # A point mass that turns about itself has an inertia of rounding squared.
     own = jnp.maximum(own, jnp.finfo(own.dtype).eps * jnp.max(own, initial=0.0))
-    return inverse, jnp.min(_ratio(diagonal**2, own, 0.0), initial=1.0)
-
-
-def apply(inverse: Inverse, f, gamma):
-    """(a, λ) for the system that was inverted."""
-    a = inverse.tangent @ f + inverse.normal @ gamma
-    return a, inverse.compliance @ gamma - inverse.normal.T @ f
+    return inverse, jnp.min(ratio(diagonal**2, own, 0.0), initial=1.0)
 
 
 @traced_once
@@ -247,17 +261,16 @@ def constrained_solve(inverse: Inverse, mass, jacobian, f, gamma, sweeps: int = 
 
     n = mass.shape[0]
 
-    def forwards(unknowns):
-        a, multipliers = unknowns[:n], unknowns[n:]
-        return jnp.concatenate([mass @ a - jacobian.T @ multipliers, jacobian @ a])
+    forwards = partial(saddle_point_product, mass, jacobian)
+    product = inverse.product(mass, jacobian)
 
     def nearby(right):
-        return jnp.concatenate(apply(inverse, right[:n], right[n:]))
+        return jnp.concatenate(inverse.apply(right[:n], right[n:]))
 
     def solve(_, right):
         unknowns = nearby(right)
         for _ in range(sweeps):
-            unknowns = unknowns + nearby(right - forwards(unknowns))
+            unknowns = unknowns + nearby(right - product(unknowns))
         return unknowns
 
     def transpose_solve(_, right):

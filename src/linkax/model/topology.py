@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from linkax.linalg.chain import PER_CELL, Chain, chained
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.joints.joint import AbstractJoint, JointKind, Motion
 from linkax.model.terms import Term
@@ -198,27 +199,54 @@ class Topology:
         kinds = self.joint_types[: self.num_bodies]
         return np.array([unit == "m" for kind in kinds for unit in kind.speed_units], dtype=bool)
 
+    def _moving(self, bodies) -> np.ndarray:
+        """The speeds that move some of the bodies on their predecessors, (n_b,) not zero."""
+        return np.unique(self.motions[bodies[self.moved_body] != 0.0, 1])
+
     @cached_property
-    def islands(self) -> tuple["Island", ...]:
-        """Parts of the mechanism that neither a loop nor an inertia connects, in the order of their speeds."""
-        moving = lambda bodies: np.unique(self.motions[bodies[self.moved_body] != 0.0, 1])
-        of_joints = [moving(around) for around in self.loop]
+    def read_by_rows(self) -> tuple[np.ndarray, ...]:
+        """The speeds that each loop row can depend on."""
+        around = [self._moving(bodies) for bodies in self.loop]
         of_constraints = [
-            np.array([*map(self.column, terms), *(c for body in bodies for c in moving(self.path[body]))], dtype=int)
+            np.unique([*map(self.column, terms), *(c for body in bodies for c in self._moving(self.path[body]))])
             for terms, bodies in zip(self.constraint_terms, self.constraint_bodies, strict=True)
         ]
         plain = [cut for cut, *_ in (*self.rotation_rows, *self.translation_rows)]
-        of_rows = [of_joints[cut] for cut in (*plain, *self.combining)] + of_constraints
-        carried = [moving(on_path) for on_path in self.path[:-1]]
+        return (*(around[cut] for cut in (*plain, *self.combining)), *(found.astype(int) for found in of_constraints))
 
+    @cached_property
+    def coupled_by_inertia(self) -> tuple[np.ndarray, ...]:
+        """Sets of speeds between which the mass matrix has entries: those on the way from ground to each body."""
+        return tuple(self._moving(on_path) for on_path in self.path[:-1])
+
+    @cached_property
+    def islands(self) -> tuple["Island", ...]:
+        """Parts of the mechanism that neither a loop nor an inertia connects, in the order of their speeds."""
         label = np.arange(self.num_speeds)
-        for together in (*carried, *of_rows):
+        for together in (*self.coupled_by_inertia, *self.read_by_rows):
             label[np.isin(label, label[together])] = np.min(label[together], initial=self.num_speeds)
-        row_label = np.array([label[columns[0]] if len(columns) else 0 for columns in of_rows], dtype=int)
+        row_label = np.array([label[columns[0]] if len(columns) else 0 for columns in self.read_by_rows], dtype=int)
         return tuple(
             Island(tuple(np.flatnonzero(row_label == part)), tuple(np.flatnonzero(label == part)))
             for part in np.unique(label)
         )
+
+    @cached_property
+    def chain(self) -> Chain | None:
+        """Cells in which the loops can be solved one after the other; None where all at once takes less."""
+        if self.num_rows == 0:
+            return None
+        at_once = sum(len(columns) ** 2 * (len(columns) + 2 * len(rows)) for rows, columns in self.islands)
+        if at_once <= PER_CELL:
+            return None
+        found = chained(self.read_by_rows, self.coupled_by_inertia, self.num_speeds)
+        return found if found.work < at_once else None
+
+    @cached_property
+    def cells_of_islands(self) -> np.ndarray:
+        """1 where a cell of the chain is part of an island, (islands, cells)."""
+        first = [min((*added, *kept)) for added, kept in zip(self.chain.added, self.chain.kept, strict=True)]
+        return np.array([np.isin(first, columns) for _, columns in self.islands])
 
     @cached_property
     def reversed(self) -> np.ndarray:
@@ -238,12 +266,6 @@ class Topology:
         return path
 
     @cached_property
-    def loop(self) -> np.ndarray:
-        """+1 for tree joints from the loop's common ancestor to the cut joint's child, -1 to its parent."""
-        cuts = slice(self.num_bodies, None)
-        return self.path[list(self.child[cuts])] - self.path[list(self.parent[cuts])]
-
-    @cached_property
     def path_factors(self) -> tuple[np.ndarray, ...]:
         """Matrices (n_b, n_b) whose product, the first one applied first, is `path` without ground.
 
@@ -258,6 +280,12 @@ class Topology:
             onto.append(np.eye(count) + (carrier[:-1, None] == np.arange(count)))
             carrier = carrier[carrier]
         return tuple(onto)
+
+    @cached_property
+    def loop(self) -> np.ndarray:
+        """+1 for tree joints from the loop's common ancestor to the cut joint's child, -1 to its parent."""
+        cuts = slice(self.num_bodies, None)
+        return self.path[list(self.child[cuts])] - self.path[list(self.parent[cuts])]
 
     @cached_property
     def root(self) -> np.ndarray:

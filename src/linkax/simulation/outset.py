@@ -23,7 +23,8 @@ ON_BRANCH = 10.0  # rank tolerances that speeds may be off a branch, relative to
 class Outset(NamedTuple):
     """A state that motion starts from, put on the closed loops.
 
-    - `rank`: of J at the states next to it along the motion, for each island of the mechanism.
+    - `rank`: of J at the states next to it along the motion, for each island of the mechanism, or each cell of its
+      chain where it has one.
     - `assembled`: not marked by `linkax.assemble`, by infinite speeds, as a state that it did not find.
     - `finite`, `closed`; `massive`: all that can move has mass; `on_branch`: the speeds lie on a
       branch of the motion; `unique`: so does, at rest, the acceleration.
@@ -68,12 +69,13 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     gap = gaps(crossing.configuration)
     small = jnp.sqrt(eps)
     at_rest = crossing.fastest(v) ** 2 <= eps * crossing.fastest(acceleration)
-    off, rank = crossing.along(jnp.where(at_rest, acceleration, v), at_rest)
+    direction = jnp.where(at_rest, acceleration, v)
+    off, rank = crossing.along(direction, at_rest)
     # Rows that are not quite dependent contradict each other by as much.
     on_branch = jnp.max(jnp.abs(off), initial=0.0) <= ON_BRANCH * method.rank_tolerance
     return Outset(
         state=start,
-        rank=rank,
+        rank=method.ranks_along(system, t, q, direction, rank),
         assembled=assembled,
         finite=finite,
         massive=massive,
