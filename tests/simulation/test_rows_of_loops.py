@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from known_answers import start
 
 import linkax as lx
-from known_answers import start
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import coefficients
 from linkax.linalg.chained_inverse import ChainedInverse
