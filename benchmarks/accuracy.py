@@ -21,7 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from known_answers import PASSING, REDUNDANT, n_four_bar, start
 from mechanisms import with_cut
-from parts import print_parts
+
+from benchmarks.parts import print_parts
 
 PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
 

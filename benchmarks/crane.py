@@ -39,7 +39,8 @@ from cranes import (
     rigid,
     slopes_and_differences,
 )
-from parts import print_parts
+
+from benchmarks.parts import print_parts
 
 LOADS = (500.0, 1000.0, 2000.0, 3000.0, 4000.0)  # [kg]
 SHOWN = 6.0  # [s]

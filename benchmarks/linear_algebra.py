@@ -21,9 +21,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 import jax.numpy as jnp
 import numpy as np
-from parts import print_parts
 
 import linkax as lx
+from benchmarks.parts import print_parts
 from linkax.linalg.row_echelon import row_echelon
 
 METHODS = {

@@ -26,8 +26,8 @@ import linkax as lx
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from known_answers import reference, start
-from parts import print_parts
 
+from benchmarks.parts import print_parts
 from linkax.plotting import plot_point_motion, plot_reaction
 from linkax.plotting.colours import BLUE, GREEN, VERMILION
 from linkax.scenes import SCENES

@@ -5,6 +5,8 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from benchmarks.machine import machine
+
 
 def print_parts(description: str, parts: dict[str, Callable[..., Iterator[dict]]], out: Path | None = None):
     """The command line of a benchmark; each part yields the rows of a table.
@@ -30,5 +32,5 @@ def print_parts(description: str, parts: dict[str, Callable[..., Iterator[dict]]
             if not arguments.json:
                 print("  " + "  ".join(f"{key} {entry}" for key, entry in row.items()), flush=True)
     if arguments.json:
-        print(json.dumps(found))
+        print(json.dumps({"machine": machine(), **found}, indent=1))
     return found, *folder

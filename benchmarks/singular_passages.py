@@ -22,7 +22,8 @@ import linkax as lx
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from known_answers import PASSING, start
-from parts import print_parts
+
+from benchmarks.parts import print_parts
 
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12, 1e-13)
 STEPS = (10e-3, 5e-3, 2e-3, 1e-3, 0.5e-3)

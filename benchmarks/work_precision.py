@@ -10,11 +10,8 @@ The problems are ten seconds long; 201 positions are saved. The telescopic crane
 
 import argparse
 import json
-import os
-import platform
 import time
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import linkax as lx
+from benchmarks.machine import machine
 from benchmarks.peers import PEERS
 from benchmarks.peers.__main__ import rows as peer_rows
 from benchmarks.peers.runs import timed
@@ -35,7 +33,6 @@ from linkax.studies.comparison import evaluations
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10, 1e-12)
 SINGLE = 1e-6  # smallest tolerance in single precision
 TARGETS = (1e-3, 1e-6, 1e-9)  # m
-PACKAGES = ("linkax", "jax", "jaxlib", "diffrax", "equinox", "numpy", "mujoco", "mujoco-mjx", "pin", "exudyn")
 
 
 class Choice(NamedTuple):
@@ -179,24 +176,6 @@ def picture(found: list[dict], key: str) -> Figure:
     panel.grid(True, color="#E5E5E5")
     figure.legend(loc="outside right upper", frameon=False, fontsize="small")
     return figure
-
-
-def machine() -> dict:
-    """Processor, number of cores, and versions of the packages that are installed."""
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return {"processor": _processor(), "cores": os.cpu_count(), "python": platform.python_version(), **versions}
-
-
-def _processor():
-    information = Path("/proc/cpuinfo")
-    lines = information.read_text().splitlines() if information.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
 
 
 def _keys(text):

@@ -77,7 +77,7 @@ def _one_of(name, value, choices):
     return value
 
 
-# Measured with benchmarks/work_precision.py: largest error of the slider over 10 s of M1a, a crank-slider that passes
+# Measured by `python -m benchmarks.work_precision M1a`: largest error over 10 s of a crank-slider that passes
 # singular configurations six times, and the cost relative to BALANCED.
 DRAFT = Accuracy(rtol=1e-4)
 """For a first look: error 2e-3 m, 0.7 times the cost of `BALANCED`."""

@@ -1,0 +1,145 @@
+"""One evaluation of the equations of motion: its time, what corrections take of it, and how both grow.
+
+Each row: speeds and loop rows; microseconds for an evaluation as a step asks for it; what part of that the correction
+of positions and speeds takes; seconds to compile it, and kilobytes that it works in; and Pinocchio's microseconds for
+`constraintDynamics` at the same state, where it is installed. Part `problems`: those of `benchmarks.problems`. Part
+`rows`: N four-bars in a row. Parts `chains` and `rings`: as many bodies, hinged to each other, from ground, and back to
+it. After those the exponents with which times grow. Times are of this machine, this run: compare ratios.
+"""
+
+import itertools
+import math
+import statistics
+import time
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+import linkax as lx
+from benchmarks.parts import print_parts
+from benchmarks.peers import PEERS
+from benchmarks.problems import PROBLEMS, Problem
+from linkax.equations.system import system_of
+
+ROWS = (1, 2, 5, 10, 20, 40, 70, 100, 200)
+BODIES = (10, 30, 100, 300, 1000)
+LONG_ENOUGH = 0.05  # seconds, for a loop over evaluations
+REPEATS = 7
+SMALLEST = 1e-30  # keeps a loop from being the same in each pass, and changes nothing
+
+
+def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
+    """Of an evaluation at a state."""
+    method, system = lx.BALANCED.method(float), system_of(mechanism, float)
+
+    def repeated(system, q, v, count, correct):
+        def evaluate(_, carry):
+            q, v = carry
+            found_v, acceleration, found_q, _ = method.derivative(system, 0.0, q, v, correct)
+            return q + SMALLEST * found_q, v + SMALLEST * (found_v + acceleration)
+
+        return jax.lax.fori_loop(0, count, evaluate, (q, v))
+
+    found, rows = {}, mechanism.topology.num_rows
+    for correct in (True, False):
+        began = time.perf_counter()
+        program = jax.jit(repeated, static_argnums=4).lower(system, state.q, state.v, 1, correct).compile()
+        found[correct] = _seconds(lambda count, program=program: program(system, state.q, state.v, count))
+        if correct:
+            compiling, memory = time.perf_counter() - began, program.memory_analysis()
+    return {
+        "speeds": mechanism.topology.num_speeds,
+        "rows": rows,
+        "us": 1e6 * found[True],
+        "correction_share": 1.0 - found[False] / found[True] if rows else None,
+        "compile_s": compiling,
+        "kB": (memory.temp_size_in_bytes + memory.argument_size_in_bytes) / 1e3,
+    }
+
+
+def _seconds(run):
+    """Of one evaluation, the median of several loops over as many as take long enough."""
+    count = 1
+    while True:
+        began = time.perf_counter()
+        jax.block_until_ready(run(count))
+        seconds = time.perf_counter() - began
+        if seconds > LONG_ENOUGH:
+            break
+        count *= 4
+    times = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        jax.block_until_ready(run(count))
+        times.append(time.perf_counter() - began)
+    return statistics.median(times) / count
+
+
+def _pinocchio(problem):
+    """Its microseconds, and the ratio to those of linkax in another row entry."""
+    try:
+        peer = PEERS["pinocchio"]
+    except ModuleNotFoundError:
+        return {}
+    return {"pinocchio_us": peer.microseconds_per_evaluation(problem.describe())}
+
+
+def _of_problem(problem):
+    found = cost(*problem.start())
+    if problem.for_peers:
+        found |= _pinocchio(problem)
+    if "pinocchio_us" in found:
+        found["ratio"] = found["pinocchio_us"] / found["us"]
+    jax.clear_caches()
+    return found
+
+
+def problems() -> Iterator[dict]:
+    """All problems that other benchmarks use."""
+    for key, problem in PROBLEMS.items():
+        yield {"problem": key, **_of_problem(problem)}
+
+
+def rows() -> Iterator[dict]:
+    """N four-bars in a row."""
+    yield from _growing("N", ROWS, lambda count: _of_problem(Problem("n-four-bar", {"N": count}, "B0", singular=True)))
+
+
+def chains() -> Iterator[dict]:
+    """Bodies hanging from each other."""
+    yield from _growing("bodies", BODIES, lambda count: cost(*_bodies(count, closed=False)))
+
+
+def rings() -> Iterator[dict]:
+    """A polygon of bodies, the first and the last hinged to ground."""
+    yield from _growing("bodies", BODIES, lambda count: cost(*_bodies(count, closed=True)))
+
+
+def _growing(name, counts, measure):
+    found = []
+    for count in counts:
+        row = {name: count, **measure(count)}
+        found.append((count, row))
+        yield row
+    for (few, less), (many, more) in itertools.pairwise(found):
+        exponent = lambda key, a=less, b=more, r=many / few: math.log(b[key] / a[key]) / math.log(r)
+        yield {"from": few, "to": many, **{f"{key}_exponent": exponent(key) for key in ("us", "compile_s", "kB")}}
+
+
+def _bodies(count, closed):
+    """Rods of one metre, each turned against the one before it as in a regular polygon."""
+    rods = [lx.rod(f"rod_{i}", 1.0, 1.0) for i in range(count)]
+    ends = [lx.GROUND.at([0.0, 0.0, 0.0]), *(rod.at("tip") for rod in rods)]
+    joints = [lx.Revolute(f"hinge_{i}", ends[i], rods[i].at("base"), axis="z") for i in range(count)]
+    turn = 2.0 * math.pi / (count + 1)
+    if closed:
+        # The side that is missing lies on the ground.
+        joints.append(lx.Revolute("last", ends[-1], lx.GROUND.at([-1.0, 0.0, 0.0]), axis="z"))
+    mechanism = lx.Mechanism(rods, joints, [lx.Gravity([0.0, -9.81, 0.0])])
+    speeds = mechanism.topology.num_speeds
+    return mechanism, lx.State(np.full(speeds, turn), np.zeros(speeds))
+
+
+if __name__ == "__main__":
+    print_parts(__doc__, {"problems": problems, "rows": rows, "chains": chains, "rings": rings})
