@@ -20,6 +20,13 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 
 import jax
 import pytest
+from hypothesis import Phase, settings
+
+# The same examples in each run; `--hypothesis-profile thorough` takes many others, and makes failing ones small.
+_quick = [Phase.explicit, Phase.generate]
+settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=30, database=None, phases=_quick)
+settings.register_profile("thorough", deadline=None, max_examples=1000)
+settings.load_profile("repeatable")
 
 sys.path.insert(0, str(Path(__file__).parent))
 

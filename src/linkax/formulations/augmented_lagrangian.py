@@ -7,6 +7,7 @@ from jax import lax
 from jax.scipy.linalg import cho_factor, cho_solve
 
 from linkax.formulations.classical import AbstractAcceleration, parameter
+from linkax.model.numbers import whole_number
 
 
 class AugmentedLagrangian(AbstractAcceleration):
@@ -24,8 +25,7 @@ class AugmentedLagrangian(AbstractAcceleration):
     sweeps: int = eqx.field(static=True, default=10)
 
     def __check_init__(self):
-        if not (isinstance(self.sweeps, int) and self.sweeps >= 1):
-            raise ValueError(f"sweeps of AugmentedLagrangian is {self.sweeps!r}; it must be an integer of at least 1")
+        whole_number(self.sweeps, "sweeps of AugmentedLagrangian")
 
     def __call__(self, mass, jacobian, force, gamma):
         size = self.penalty * jnp.max(jnp.diagonal(mass))

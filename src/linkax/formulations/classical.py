@@ -15,7 +15,7 @@ from linkax.equations.loops import gamma, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
-from linkax.model.numbers import known, number
+from linkax.model.numbers import known, number, whole_number
 from linkax.tracing import traced_once
 
 
@@ -97,8 +97,7 @@ class ClassicalFormulation(AbstractFormulation):
         ):
             if not isinstance(getattr(self, what), kind):
                 raise ValueError(f"{what} of ClassicalFormulation is {getattr(self, what)!r}, which is none")
-        if not (isinstance(self.sweeps, int) and self.sweeps >= 1):
-            raise ValueError(f"sweeps of ClassicalFormulation is {self.sweeps!r}; it must be an integer of at least 1")
+        whole_number(self.sweeps, "sweeps of ClassicalFormulation")
 
     @property
     def nearest(self):

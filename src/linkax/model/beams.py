@@ -20,7 +20,7 @@ from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce, Load
 from linkax.model.joints.bending import MASS_PLACES, NUM_STRAINS, BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.joint import AbstractJoint
-from linkax.model.numbers import known, number, require, rotation_matrix
+from linkax.model.numbers import flag, instance, known, number, real, require, rotation_matrix, whole_number
 from linkax.model.sections import Section, positive
 from linkax.model.terms import Term
 
@@ -76,12 +76,11 @@ class Beam(AbstractBody):
         self.name = body_name(name)
         what = f"beam {name!r}"
         self.length = positive(length, f"{what}: length [m]")
-        if not isinstance(section, Section):
-            raise ValueError(f"{what}: section is {section!r}; give a lx.Section, lx.rectangle(...) or lx.circle(...)")
-        self.section = section
-        if isinstance(elements, bool) or not isinstance(elements, int) or elements < 1:
-            raise ValueError(f"{what}: elements is {elements!r}; give an integer of at least 1")
-        self.elements = elements
+        sections = "give a lx.Section, lx.rectangle(...) or lx.circle(...)"
+        self.section = instance(section, Section, f"{what}: section", sections)
+        self.elements = whole_number(elements, f"{what}: elements")
+        flags = {"torsion": torsion, "stretch": stretch, "shear": shear}
+        torsion, stretch, shear = (flag(entry, f"{what}: {name}") for name, entry in flags.items())
         if bends not in ("yz", "y", "z", ""):
             raise ValueError(f"{what}: bends is {bends!r}; known: 'yz', 'y', 'z', ''")
         asked = [torsion, "y" in bends, "z" in bends, stretch, shear and "z" in bends, shear and "y" in bends]
@@ -114,7 +113,9 @@ class Beam(AbstractBody):
                 raise ValueError(f"beam {self.name!r} has no frame {where!r}; give 'base', 'tip', or a distance [m]")
             return Frame(ends[where], np.zeros(3), axes)
         what = f"place of a frame on beam {self.name!r} [m]"
-        offset = number(where, (), what) * np.eye(3)[0] if np.ndim(where) == 0 else number(where, (3,), what)
+        offset = real(where, what)
+        offset = offset * np.eye(3)[0] if offset.shape == () else offset
+        offset = number(offset, (3,), what)
         if element is None:
             along = known(offset[0] / self.element_length)
             if along is None:

@@ -1,13 +1,14 @@
 """Rigid bodies and the frames on them."""
 
 import abc
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import Constant, known, number, require, rotation_matrix, value
+from linkax.model.numbers import Constant, instance, known, number, require, rotation_matrix, value
 
 GROUND_NAME = "ground"
 
@@ -88,11 +89,18 @@ class RigidBody(AbstractBody):
             "it must be zero or more",
         )
         self.center_of_mass = number(center_of_mass, (3,), f"body {name!r}: center_of_mass [m]")
-        self.inertia = _inertia_tensor(inertia, f"body {name!r}: inertia [kg m²]")
+        self.inertia = inertia_tensor(inertia, f"body {name!r}: inertia [kg m²]")
+        frames = {} if frames is None else frames
+        instance(frames, Mapping, f"body {name!r}: frames", 'give {"tip": [x, y, z]}')
         self.frames = {
-            label: number(offset, (3,), f"body {name!r}: frame {label!r} [m]")
-            for label, offset in (frames or {}).items()
+            self._label(label): number(offset, (3,), f"body {name!r}: frame {label!r} [m]")
+            for label, offset in frames.items()
         }
+
+    def _label(self, label):
+        if not isinstance(label, str) or not label:
+            raise ValueError(f"body {self.name!r}: name of a frame is {label!r}; give a non-empty string")
+        return label
 
     @property
     def reference(self):
@@ -143,7 +151,8 @@ def _depth(entry) -> int:
     return np.ndim(entry)
 
 
-def _inertia_tensor(inertia, what):
+def inertia_tensor(inertia, what):
+    """A tensor that a body can have, (3, 3), of itself or of its diagonal; `what` names it in errors."""
     diagonal = _depth(value(inertia)) == 1
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)
     if diagonal:
@@ -151,7 +160,7 @@ def _inertia_tensor(inertia, what):
     concrete = known(tensor)
     if concrete is not None:
         scale = np.max(np.abs(concrete))
-        moments = np.linalg.eigvalsh((concrete + concrete.T) / 2)
+        moments = np.linalg.eigvalsh(concrete / 2 + concrete.T / 2)
         problem = None
         if not np.allclose(concrete, concrete.T, rtol=0.0, atol=1e-12 * scale):
             problem = "it must be symmetric"

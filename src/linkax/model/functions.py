@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from linkax.model.numbers import number
+from linkax.model.numbers import converted, number
 
 
 class Law(eqx.Module):
@@ -35,11 +35,22 @@ class Law(eqx.Module):
         tree, is_number, rest = self.structure
         numbers = iter(self.numbers)
         leaves = [next(numbers) if traced else leaf for traced, leaf in zip(is_number, rest, strict=True)]
-        found = jnp.asarray(jax.tree.unflatten(tree, leaves)(*arguments))
+        try:
+            found = jax.tree.unflatten(tree, leaves)(*arguments)
+        except Exception as error:
+            raise ValueError(f"{self.what}: its function raises {raised(error)}") from error
+        found = converted(found, f"{self.what}: what its function returns", jnp.asarray)
         if found.shape != self.shape:
             expected = "a single number" if self.shape == () else f"an array of shape {self.shape}"
             raise ValueError(f"{self.what}: its function returns shape {found.shape}; it must return {expected}")
-        return found
+        return found if jnp.issubdtype(found.dtype, jnp.floating) else 1.0 * found
+
+
+def raised(error) -> str:
+    """What a user's function raised, and what it is often due to."""
+    first, *_ = str(error).split("\n")
+    remedy = "make it of operations of jax.numpy, with jnp.where in place of if"
+    return f"{type(error).__name__}: {first}; JAX traces it, so {remedy}"
 
 
 def number_or_law(entry, shape: tuple[int, ...], what: str):

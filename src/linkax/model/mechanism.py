@@ -1,6 +1,7 @@
 """A mechanism: bodies, joints, constraints and forces, checked, with its spanning tree."""
 
 from collections import Counter
+from collections.abc import Iterable
 
 import equinox as eqx
 
@@ -12,6 +13,7 @@ from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
+from linkax.model.numbers import instance
 from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
 
 
@@ -48,11 +50,13 @@ class Mechanism(eqx.Module):
         constraints = _checked(
             constraints, (AbstractConstraint, Distance), "constraints", "Coupling, Drive, Rope or Distance"
         )
+        joints = _checked(joints, AbstractJoint, "joints", "Revolute, Prismatic and their like")
         joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
         constraints = [c for c in constraints if not isinstance(c, Distance)]
         bodies = _checked(bodies, (RigidBody, Beam), "bodies", "RigidBody or Beam")
-        joints = _checked(joints, AbstractJoint, "joints", "Joint")
-        forces = _checked(forces, AbstractForce, "forces", "Force")
+        if not bodies:
+            raise ValueError("bodies is empty, []; give at least one body")
+        forces = _checked(forces, AbstractForce, "forces", "Gravity, Spring and their like")
         beams = [body for body in bodies if isinstance(body, Beam)]
         bodies, joints, forces, constraints = taken_apart(bodies, joints, forces, constraints)
         by_name, joint_by_name = _by_name(bodies, "body"), _by_name(joints, "joint")
@@ -115,12 +119,10 @@ def _find(name, names, what):
     return names.index(name)
 
 
-def _checked(elements, kind, what, called=None):
-    elements = list(elements)
-    for element in elements:
-        if not isinstance(element, kind):
-            raise ValueError(f"{what} holds {element!r}, which is no {called or kind.__name__}")
-    return elements
+def _checked(elements, kind, what, called):
+    if not isinstance(elements, Iterable):
+        raise ValueError(f"{what} is {elements!r}; give a list of {called}")
+    return [instance(element, kind, f"an entry of {what}", f"give a list of {called}") for element in elements]
 
 
 def _by_name(elements, what):

@@ -4,6 +4,8 @@ Values that are known when a model is built are validated there. Values under a 
 transformation are not known; they are passed on, and a bad one shows in the solution's result.
 """
 
+import numbers
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,22 +48,62 @@ def all_known(tree) -> bool:
 
 def number(entry, shape: tuple[int, ...], what: str):
     """A traced leaf of the given shape in double precision; `what` names it in errors."""
-    try:
-        if isinstance(entry, jax.Array):
-            array = jnp.asarray(entry, dtype=float)
-        elif any(isinstance(part, jax.Array) for part in jax.tree.leaves(entry)):
-            array = jnp.stack([jnp.asarray(part, dtype=float) for part in entry])
-        else:
-            array = np.asarray(entry, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} is {entry!r}; it must be a number or an array of numbers") from error
+    array = real(entry, what)
     if array.shape != shape:
         expected = "a single number" if shape == () else f"an array of shape {shape}"
         raise ValueError(f"{what} has shape {array.shape}; it must be {expected}")
-    concrete = known(array)
-    if concrete is not None and not np.all(np.isfinite(concrete)):
-        raise ValueError(f"{what} is {concrete.tolist()}; it must be finite")
-    return array
+    return require(array, lambda concrete: np.all(np.isfinite(concrete)), what, "it must be finite")
+
+
+def real(entry, what: str):
+    """Real numbers of any shape, in double precision; neither text, booleans nor None are taken for numbers."""
+    return converted(entry, what, _in_double)
+
+
+def _in_double(entry):
+    if isinstance(entry, jax.Array):
+        return jnp.asarray(entry, dtype=float)
+    if any(isinstance(part, jax.Array) for part in jax.tree.leaves(entry)):
+        return jnp.stack([jnp.asarray(part, dtype=float) for part in entry])
+    return np.asarray(entry, dtype=np.float64)
+
+
+def converted(entry, what: str, convert):
+    """What `convert` makes of an entry that holds real numbers alone."""
+    try:
+        if not all(map(_is_real, jax.tree.leaves(entry, is_leaf=lambda part: part is None))):
+            raise TypeError("no real number")
+        return convert(entry)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{what} is {entry!r}; it must be a number or an array of numbers, real ones") from error
+
+
+def _is_real(part) -> bool:
+    if getattr(part, "dtype", np.dtype(object)) == np.dtype(object):
+        entries = np.ravel(part).tolist()
+        return all(isinstance(entry, numbers.Real) and not isinstance(entry, bool) for entry in entries)
+    return jnp.issubdtype(part.dtype, jnp.floating) or jnp.issubdtype(part.dtype, jnp.integer)
+
+
+def whole_number(entry, what: str, least: int = 1) -> int:
+    """An integer of at least `least`."""
+    if isinstance(entry, bool) or not isinstance(entry, int | np.integer) or entry < least:
+        raise ValueError(f"{what} is {entry!r}; it must be an integer of at least {least}")
+    return int(entry)
+
+
+def flag(entry, what: str) -> bool:
+    """True or False."""
+    if not isinstance(entry, bool | np.bool_):
+        raise ValueError(f"{what} is {entry!r}; give True or False")
+    return bool(entry)
+
+
+def instance(entry, kind, what: str, remedy: str):
+    """Something of a kind, or of one of several."""
+    if not isinstance(entry, kind):
+        raise ValueError(f"{what} is {entry!r}; {remedy}")
+    return entry
 
 
 def require(array, condition, what: str, remedy: str):
@@ -80,21 +122,23 @@ def unit_axis(axis, what: str):
             raise ValueError(f"{what} is {axis!r}; known names are {known_axes}, or give a vector")
         return Constant(COORDINATE_AXES[axis])
     vector = number(axis, (3,), what)
-    length = np.linalg.norm(vector) if isinstance(vector, np.ndarray) else jnp.linalg.norm(vector)
-    require(length, lambda size: size > 0.0, f"{what} has zero length: its norm", "give a nonzero vector")
+    with np.errstate(over="ignore", under="ignore"):
+        length = np.linalg.norm(vector) if isinstance(vector, np.ndarray) else jnp.linalg.norm(vector)
+    if known(length) is not None and not 0.0 < known(length) < np.inf:
+        size = "zero" if length == 0.0 else "infinite"
+        raise ValueError(f"{what} has {size} length: {known(vector).tolist()}; give a nonzero vector of finite length")
     return Constant(vector / length) if isinstance(vector, np.ndarray) else vector / length
 
 
 def perpendicular_axis(axis, first, what: str):
     """A unit vector like `unit_axis`, checked to be at a right angle to another."""
     second = unit_axis(axis, what)
-    if isinstance(second, Constant) and isinstance(first, Constant):
-        cosine = float(second.array @ first.array)
-        if abs(cosine) > 1e-12:
-            raise ValueError(
-                f"{what} is {second.array.tolist()}, at {np.degrees(np.arccos(cosine)):.6g} degrees to the first axis "
-                f"{first.array.tolist()}; it must be at a right angle to it"
-            )
+    one, other = known(value(first)), known(value(second))
+    if one is not None and other is not None and abs(cosine := float(one @ other)) > 1e-12:
+        raise ValueError(
+            f"{what} is {other.tolist()}, at {np.degrees(np.arccos(cosine)):.6g} degrees to the first axis "
+            f"{one.tolist()}; it must be at a right angle to it"
+        )
     return second
 
 

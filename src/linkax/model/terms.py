@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 
 class Term(NamedTuple):
     """A joint's name, and which of its speeds, counted from 0; None for the only one."""
@@ -13,6 +15,7 @@ class Term(NamedTuple):
 def term(entry, what: str) -> Term:
     """A joint's name, or (name, index), as a user gives it; `what` names the element in errors."""
     joint, index = entry if isinstance(entry, tuple) and len(entry) == 2 else (entry, None)
-    if not isinstance(joint, str) or not (index is None or (isinstance(index, int) and not isinstance(index, bool))):
+    whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
+    if not isinstance(joint, str) or not (index is None or whole):
         raise ValueError(f"{what}: joint is {entry!r}; give the name of a joint, or (name, index of its speed)")
-    return Term(joint, index)
+    return Term(joint, None if index is None else int(index))

@@ -1,0 +1,170 @@
+"""Any mechanism with any one thing wrong is refused when it is built, by an error that names it; a right one is not."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plans import BAD, Body, Part, plans
+from refusals import Shown, refused
+
+import linkax as lx
+from linkax.equations.system import system_of
+from linkax.simulation.accuracy import BALANCED
+
+UNSHOWN = ("law", "frames", "coefficients")  # functions and dictionaries have no short name
+
+
+@settings(max_examples=10)
+@given(plan=plans(), data=st.data())
+def test_one_bad_argument_is_named(plan, data):
+    """One argument of each sort that the mechanism has, with every value that this sort cannot have."""
+    by_sort = {}
+    for path, sort, named in plan.slots():
+        by_sort.setdefault(sort, []).append((path, named))
+    for sort, slots in by_sort.items():
+        path, named = data.draw(st.sampled_from(slots))
+        for value in BAD[sort]:
+            words = () if path[-1] == "name" else named
+            words = words if sort in UNSHOWN else (*words, Shown(value))
+            refused(plan.with_bad(path, value).build, *words)
+
+
+def _rod(name):
+    return Part(lx.rod, (name,), {"name": name, "length": 1.0, "mass": 1.0}, {})
+
+
+def _loose(plan):
+    """The plan with a rod more, that hangs on nothing."""
+    return _with(plan, "bodies", _rod("rod"))
+
+
+def _hung(plan):
+    """The plan with a rod more, that is welded to the first body."""
+    return _with(_loose(plan), "joints", _joint(lx.Fixed, "weld", "body_0", "rod"))
+
+
+def _with(plan, place, *parts):
+    return dataclasses.replace(plan, **{place: (*getattr(plan, place), *parts)})
+
+
+def _joint(kind, name, parent, child, **more):
+    ends = {"parent": Body(parent), "child": child if isinstance(child, Part) else Body(child)}
+    return Part(kind, (name,), {"name": name, **ends, **more}, {})
+
+
+def _force(kind, **arguments):
+    return Part(kind, (kind.__name__,), arguments, {})
+
+
+def _coupling(**coefficients):
+    return Part(lx.Coupling, ("gears",), {"name": "gears", "coefficients": coefficients}, {})
+
+
+def _drive(joint):
+    return Part(lx.Drive, ("motor",), {"name": "motor", "joint": joint, "motion": jnp.sin}, {})
+
+
+# What is wrong between elements that are right by themselves, and what the error must name.
+STRUCTURES = {
+    "two bodies of one name": (lambda plan: _with(plan, "bodies", _rod("body_0")), ["'body_0'"]),
+    "two joints of one name": (
+        lambda plan: _with(_hung(plan), "joints", _joint(lx.Fixed, "weld", None, "rod")),
+        ["'weld'", "2 times"],
+    ),
+    "a constraint named like a joint": (
+        lambda plan: _with(plan, "constraints", _joint(lx.Distance, "pin", None, "body_0", length=1.0)),
+        ["'pin'", "2 times"],
+    ),
+    "a joint to a body that is not there": (
+        lambda plan: _with(plan, "joints", _joint(lx.Fixed, "weld", None, _rod("rod"))),
+        ["'weld'", "'rod'"],
+    ),
+    "a body that hangs on nothing": (_loose, ["'rod'", "ground"]),
+    "a joint of a body with itself": (
+        lambda plan: _with(_hung(plan), "joints", _joint(lx.Spherical, "knot", "rod", "rod")),
+        ["'knot'", "'rod'"],
+    ),
+    "a cut joint that closes no loop": (
+        lambda plan: _with(_loose(plan), "joints", _joint(lx.Spherical, "end", "body_0", "rod", cut=True)),
+        ["'end'", "cut=True"],
+    ),
+    "a distance that carries a body": (
+        lambda plan: _with(_loose(plan), "constraints", _joint(lx.Distance, "tie", None, "rod", length=1.0)),
+        ["'rod'", "ground"],
+    ),
+    "a force along an unknown joint": (
+        lambda plan: _with(plan, "forces", _force(lx.JointTorque, joint="nip", torque=1.0)),
+        ["JointTorque", "'nip'"],
+    ),
+    "a speed that a joint lacks": (
+        lambda plan: _with(plan, "forces", _force(lx.JointDamper, joint=("pin", 1), damping=1.0)),
+        ["JointDamper", "'pin'", "1"],
+    ),
+    "a force along a weld": (
+        lambda plan: _with(_hung(plan), "forces", _force(lx.JointTorque, joint="weld", torque=1.0)),
+        ["JointTorque", "'weld'"],
+    ),
+    "a force on a body that is not there": (
+        lambda plan: _with(plan, "forces", _force(lx.PointForce, point=_rod("rod"), force=[1.0, 0.0, 0.0])),
+        ["PointForce", "'rod'"],
+    ),
+    "a coupling with an unknown joint": (
+        lambda plan: _with(plan, "constraints", _coupling(pin=1.0, nip=2.0)),
+        ["'gears'", "'nip'"],
+    ),
+    "a drive of a weld": (lambda plan: _with(_hung(plan), "constraints", _drive("weld")), ["'motor'", "'weld'"]),
+}
+
+
+@pytest.mark.parametrize("case", STRUCTURES)
+@settings(max_examples=5)
+@given(plan=plans())
+def test_elements_that_do_not_fit_are_named(case, plan):
+    broken, words = STRUCTURES[case]
+    refused(broken(plan).build, *words)
+
+
+NO_ELEMENTS = [None, 3, "bodies", {"a": 1}, [None], ["part"], [lx.RigidBody], [lx.GROUND], [[]], print, [3.0]]
+
+
+@pytest.mark.parametrize("place", ["bodies", "joints", "forces", "constraints"])
+@pytest.mark.parametrize("entry", NO_ELEMENTS, ids=repr)
+def test_what_is_no_element_is_named(place, entry):
+    link = lx.rod("link", 1.0, 1.0)
+    elements = {"bodies": [link], "joints": [lx.Revolute("pin", lx.GROUND, link, "z")]}
+    first = next(iter(entry)) if isinstance(entry, list | dict | str) else entry
+    refused(lambda: lx.Mechanism(**elements | {place: entry}), place, repr(first))
+
+
+@pytest.mark.parametrize("place", ["bodies", "joints", "forces", "constraints"])
+def test_one_element_in_place_of_a_list_is_named(place):
+    link = lx.rod("link", 1.0, 1.0)
+    elements = {"bodies": link, "joints": lx.Revolute("pin", lx.GROUND, link, "z")}
+    one = elements | {"forces": lx.Gravity([0.0, 0.0, -9.81]), "constraints": lx.Drive("motor", "pin", jnp.sin)}
+    given = {name: [element] for name, element in elements.items()} | {place: one[place]}
+    refused(lambda: lx.Mechanism(**given), place, "list")
+
+
+def test_second_axes_that_are_known_are_checked_whatever_they_are():
+    for axis, second in (([1, 0, 0], jnp.array([1.0, 1.0, 0.0])), (jnp.array([1.0, 0.0, 0.0]), [1, 1, 0])):
+        link = lx.rod("link", 1.0, 1.0)
+        build = lambda a=axis, b=second, link=link: lx.Universal("cross", lx.GROUND, link, a, second_axis=b)
+        refused(build, "'cross'", "second_axis", "45 degrees")
+
+
+@settings(max_examples=10)
+@given(plan=plans())
+def test_a_right_mechanism_is_not_refused(plan):
+    """And has equations of motion, as far as can be seen without numbers: those of the laws are in tests/equations."""
+    mechanism = plan.build()
+    topology = mechanism.topology
+    state = lx.State(jnp.zeros(topology.num_coordinates), jnp.zeros(topology.num_speeds))
+
+    def acceleration(state):
+        system = system_of(mechanism, float)
+        return BALANCED.method(system.dtype).derivative(system, jnp.zeros(()), state.q, state.v, True)[1]
+
+    assert eqx.filter_eval_shape(acceleration, state).shape == (topology.num_speeds,)
