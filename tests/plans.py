@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hypothesis import settings
 from hypothesis import strategies as st
 
 import linkax as lx
@@ -92,6 +93,9 @@ def made(entry, bodies):
         return [made(value, bodies) for value in entry]
     return entry
 
+
+# As many examples as the profile says where one takes no time, fewer where it takes some.
+SOME, FEW = (settings(max_examples=settings().max_examples // part) for part in (3, 6))
 
 # What no number is, or no single one.
 NUMBER = [

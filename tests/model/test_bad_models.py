@@ -5,9 +5,9 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from plans import BAD, Body, Part, plans
+from plans import BAD, FEW, SOME, Body, Part, plans
 from refusals import Shown, refused
 
 import linkax as lx
@@ -17,7 +17,7 @@ from linkax.simulation.accuracy import BALANCED
 UNSHOWN = ("law", "frames", "coefficients")  # functions and dictionaries have no short name
 
 
-@settings(max_examples=10)
+@SOME
 @given(plan=plans(), data=st.data())
 def test_one_bad_argument_is_named(plan, data):
     """One argument of each sort that the mechanism has, with every value that this sort cannot have."""
@@ -120,7 +120,7 @@ STRUCTURES = {
 
 
 @pytest.mark.parametrize("case", STRUCTURES)
-@settings(max_examples=5)
+@FEW
 @given(plan=plans())
 def test_elements_that_do_not_fit_are_named(case, plan):
     broken, words = STRUCTURES[case]
@@ -155,7 +155,7 @@ def test_second_axes_that_are_known_are_checked_whatever_they_are():
         refused(build, "'cross'", "second_axis", "45 degrees")
 
 
-@settings(max_examples=10)
+@FEW
 @given(plan=plans())
 def test_a_right_mechanism_is_not_refused(plan):
     """And has equations of motion, as far as can be seen without numbers: those of the laws are in tests/equations."""

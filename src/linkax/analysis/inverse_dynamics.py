@@ -18,7 +18,8 @@ from linkax.linalg.constrained_solve import constrained_solve, invert, least_mul
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.accuracy import BALANCED
-from linkax.simulation.given import by_joint
+from linkax.simulation.diagnosis import massless_bodies
+from linkax.simulation.given import by_joint, checked_state, checked_time
 from linkax.simulation.state import State
 
 MET = 1e-9  # relative to the largest acceleration
@@ -46,11 +47,19 @@ def inverse_dynamics(mechanism: Mechanism, state: State, accelerations, *, t=0.0
 
     **Raises:** `ValueError` where the loops do not allow the accelerations together, naming the joint.
     """
+    state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
     if not accelerations:
         raise ValueError("inverse_dynamics needs accelerations; give {joint: acceleration, ...}")
     wanted = by_joint(mechanism, accelerations, "acceleration", lambda joint: len(joint.speed_units))
-    acceleration, forces, misses = _inverse_dynamics(mechanism, state, wanted, jnp.asarray(t, float))
+    acceleration, forces, misses = _inverse_dynamics(mechanism, state, wanted, t)
     if known(acceleration) is not None:
+        if not np.all(np.isfinite(acceleration)):
+            system = system_of(mechanism, state.q.dtype)
+            massless = massless_bodies(system, BALANCED.method(system.dtype), t, state.q)
+            raise ValueError(
+                "accelerations are not finite; give mass and inertia to bodies that move without, "
+                f"{', '.join(map(repr, massless)) or 'none here'}, and finite numbers to forces"
+            )
         scale = max(1.0, *(float(np.max(np.abs(entry), initial=0.0)) for entry in wanted.values))
         for along, miss in zip(wanted.terms, misses, strict=True):
             if not np.max(np.abs(miss), initial=0.0) <= MET * scale:

@@ -11,6 +11,7 @@ from linkax.linalg.constrained_solve import least_multipliers, singularity_dista
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import Topology
 from linkax.simulation.accuracy import BALANCED, Accuracy
+from linkax.simulation.given import check_accuracy, checked_state, checked_time
 from linkax.simulation.state import State
 
 INVOLVED = 1e-6  # least part of a row in a self-stress of magnitude one
@@ -73,7 +74,8 @@ def mobility(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = 
 
     **Arguments:** `t`: time [s]; `accuracy`: whose rank tolerance decides.
     """
-    return _mobility(mechanism, state, jnp.asarray(t, float), accuracy)
+    check_accuracy(accuracy)
+    return _mobility(mechanism, checked_state(mechanism, state), jnp.asarray(checked_time(t, "t")), accuracy)
 
 
 @eqx.filter_jit

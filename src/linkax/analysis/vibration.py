@@ -6,6 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Int
 
@@ -19,9 +20,11 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import all_known, known
+from linkax.model.numbers import all_known, known, whole_number
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.assembly import CLOSED, LONGEST_STEP
+from linkax.simulation.diagnosis import massless_bodies
+from linkax.simulation.given import checked_state, checked_time
 from linkax.simulation.state import State
 
 MOST_STEPS = 200
@@ -131,7 +134,8 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
     **Raises:** `EquilibriumError` where the search does not come to rest, or cannot close the loops; inside
     JAX transformations nothing is raised, and coordinates are not finite then.
     """
-    found, remaining, gap = _equilibrium(mechanism, state, jnp.asarray(t, float))
+    state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
+    found, remaining, gap = _equilibrium(mechanism, state, t)
     if not all_known((found, remaining, gap)):
         return State(jnp.where((remaining <= BALANCED_STEP) & (gap <= CLOSED), found.q, jnp.nan), found.v)
     if not gap <= CLOSED:
@@ -254,13 +258,23 @@ def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: 
     **Arguments:** `degrees_of_freedom`: of the mechanism; needed inside JAX transformations, where
     they cannot be found.
     """
-    t = jnp.asarray(t, float)
+    state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
     if degrees_of_freedom is None:
         rank = known(_rank(mechanism, state, t))
         if rank is None:
-            raise ValueError("linearise inside a JAX transformation needs degrees_of_freedom=")
+            raise ValueError("linearise inside a JAX transformation needs degrees_of_freedom=; give their number")
         degrees_of_freedom = mechanism.topology.num_speeds - int(rank)
-    return _linearise(mechanism, state, t, degrees_of_freedom)
+    asked = whole_number(degrees_of_freedom, "degrees_of_freedom", least=0)
+    found, there = _linearise(mechanism, state, t, asked)
+    if known(there) is not None and there != asked:
+        raise ValueError(f"degrees_of_freedom is {asked}; the mechanism has {there} here: give that, or leave it out")
+    frequencies = known(found.natural_frequencies)
+    if frequencies is not None and not np.all(np.isfinite(frequencies)):
+        system = system_of(mechanism, state.q.dtype)
+        massless = massless_bodies(system, BALANCED.method(system.dtype), t, state.q)
+        why = f"bodies {', '.join(map(repr, massless))} move without mass" if massless else "forces are not finite"
+        raise ValueError(f"frequencies are not finite, because {why}; give mass and inertia, or finite numbers")
+    return found
 
 
 @eqx.filter_jit
@@ -275,16 +289,18 @@ def _linearise(mechanism, state, t, count):
     method = BALANCED.method(system.dtype)
     moving = _Moving.of(system, method, t, state.q)
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
-    columns = jnp.argsort(jnp.sum(moving.basis**2, axis=0) == 0.0)[:count]
+    none = jnp.sum(moving.basis**2, axis=0) == 0.0
+    columns = jnp.argsort(none)[:count]
     at_columns = lambda matrix: matrix[columns[:, None], columns[None, :]]
     _, slopes = moving.slopes(lambda both: moving.acceleration(*jnp.split(both, 2)), jnp.concatenate([rest, rest]))
     stiffness, damping = (at_columns(-part) for part in jnp.split(slopes, 2, axis=1))
     values, vectors = jnp.linalg.eigh((stiffness + stiffness.T) / 2.0)
     basis = moving.basis[:, columns]
-    return Linearisation(
+    found = Linearisation(
         natural_frequencies=jnp.sign(values) * jnp.sqrt(jnp.where(values == 0.0, 1.0, jnp.abs(values))),
         modes=basis @ vectors,
         basis=basis,
         stiffness=stiffness,
         damping=damping,
     )
+    return found, jnp.sum(jnp.logical_not(none))

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from linkax.model.bodies import Frame, frame_of
 from linkax.model.elements import AbstractElement
-from linkax.model.functions import Law, evaluated, number_or_law
+from linkax.model.functions import Law, evaluated, number_or_law, raised
 from linkax.model.numbers import number, require
 from linkax.model.terms import Term, term
 from linkax.spatial.vectors import dot
@@ -37,6 +37,9 @@ class Load(NamedTuple):
         return Load(*(a + b for a, b in zip(self, other, strict=True)))
 
 
+GIVE_LOAD = "give a linkax.Load, made by motion.point_load, motion.joint_load or Load.none(motion.system)"
+
+
 class AbstractForce(AbstractElement):
     """A force element; a user's own is a subclass with a `load`.
 
@@ -57,6 +60,24 @@ class AbstractForce(AbstractElement):
     @abc.abstractmethod
     def load(self, t, motion) -> Load:
         """What the element applies at time t [s]."""
+
+    def applied(self, t, motion) -> Load:
+        """The load, checked for what a user's own class may do wrong."""
+        try:
+            found = self.load(t, motion)
+        except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+            raise ValueError(f"{self.described}: its load raises {raised(error)}") from error
+        whole = Load.none(motion.system)
+        if not isinstance(found, Load):
+            raise ValueError(f"{self.described}: its load is {found!r}; {GIVE_LOAD}")
+        for name, part, right in zip(Load._fields, found, whole, strict=True):
+            shape, dtype = jnp.shape(part), jnp.result_type(part)
+            if shape != right.shape or not jnp.issubdtype(dtype, jnp.floating):
+                raise ValueError(
+                    f"{self.described}: {name} of its load has shape {shape} and type {dtype}, not {right.shape} and "
+                    f"{right.dtype}; {GIVE_LOAD}"
+                )
+        return found
 
     def potential_energy(self, configuration):
         """Potential energy [J]; zero for an element that has none."""

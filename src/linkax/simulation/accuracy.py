@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.numbers import number, require
 
 Projection = Literal["both", "stage", "step", "none"]
 Metric = Literal["mass", "identity"]
@@ -61,14 +62,10 @@ class Accuracy(eqx.Module):
 
 
 def _number(name, value, zero=False):
-    try:
-        number = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is {value!r}; it must be a number") from error
-    if number.shape != () or not (np.isfinite(number) and (number > 0.0 or (zero and number == 0.0))):
-        kind = "non-negative" if zero else "positive"
-        raise ValueError(f"{name} is {value!r}; it must be one {kind}, finite number, such as 1e-8")
-    return number
+    kind = "zero or more" if zero else "positive"
+    return require(
+        number(value, (), name), lambda x: x > 0.0 or (zero and x == 0.0), name, f"it must be {kind}, such as 1e-8"
+    )
 
 
 def _one_of(name, value, choices):

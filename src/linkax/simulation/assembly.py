@@ -17,7 +17,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import all_known
 from linkax.model.terms import Term
 from linkax.simulation.accuracy import BALANCED
-from linkax.simulation.given import Given, by_joint, coordinates_by_joint
+from linkax.simulation.given import Given, by_joint, check_mechanism, checked_time, coordinates_by_joint
 from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
@@ -66,6 +66,8 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
     raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
     """
+    check_mechanism(mechanism)
+    t = jnp.asarray(checked_time(t, "t"))
     positions, guess = (
         coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess"))
     )
@@ -73,7 +75,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     for name, _ in guess.terms:
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
-    state, remainder = _assemble(mechanism, positions, speeds, guess, jnp.asarray(t, float))
+    state, remainder = _assemble(mechanism, positions, speeds, guess, t)
     if not all_known((state, remainder)):
         return State(state.q, jnp.where(remainder.is_met(), state.v, jnp.inf))
     _raise_if_open(mechanism, state, t, jax.tree.map(np.asarray, remainder))

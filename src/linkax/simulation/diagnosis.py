@@ -30,11 +30,11 @@ def cause(solution, state) -> str:
     method = solution.accuracy.method(state.q.dtype)
     result, t = solution.result, solution.t_end
     if result == RESULTS.not_finite:
-        return _not_finite(solution.mechanism) or _forces(solution, system, t, state)
+        return _not_finite(solution.mechanism) or _forces(solution, system, t, state) or _laws(solution.mechanism, t)
     if result == RESULTS.not_closed:
         return _open(system, solution.mechanism, t, method.close(system, t, state.q, state.v)[0])
     if result == RESULTS.massless:
-        return f" They are {_listed(_massless_bodies(system, method, t, state.q))}."
+        return f" They are {_listed(massless_bodies(system, method, t, state.q))}."
     if (result == RESULTS.no_branch) | (result == RESULTS.not_unique):
         basis = Crossing.at(system, t, state.q, method.rank_tolerance).inverse.basis
         return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
@@ -61,6 +61,16 @@ def _forces(solution, system, t, state):
         load = force.load(jnp.asarray(t), motion)
         if not all(bool(jnp.all(jnp.isfinite(part))) for part in load):
             return f" The load of {force.described} is not finite at t = {float(t):.6g} s."
+    return ""
+
+
+def _laws(mechanism, t):
+    """Constraints whose function of time, or its first two derivatives, is not finite."""
+    for constraint in mechanism.constraints:
+        rate = jax.jacfwd(constraint.right_side)
+        if not all(bool(jnp.isfinite(law(t))) for law in (constraint.right_side, rate, jax.jacfwd(rate))):
+            when = f"at t = {float(t):.6g} s"
+            return f" The function of {constraint.described}, or a derivative of it, is not finite {when}."
     return ""
 
 
@@ -110,7 +120,7 @@ def _open(system, mechanism, t, q):
     return f" Joint {names[widest]!r} is open by {sizes[widest]:.3g}, in radians or lengths of the mechanism."
 
 
-def _massless_bodies(system, method, t, q):
+def massless_bodies(system, method, t, q):
     """Bodies that can move without moving any mass: magnitudes of masses do not matter, so all are one."""
     weigh = lambda numbers, size: jnp.where(size > 0.0, numbers / jnp.where(size > 0.0, size, 1.0), 0.0)
     moment = jnp.max(jnp.abs(system.inertia), axis=(1, 2))

@@ -1,12 +1,17 @@
-"""Numbers that users give for joints, checked."""
+"""What users give for a mechanism, checked: numbers for joints, states, times."""
+
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known, number
+from linkax.model.numbers import instance, known, number, real, require
 from linkax.model.terms import Term, term
+from linkax.simulation.accuracy import Accuracy
+from linkax.simulation.state import State
 
 
 class Given(eqx.Module):
@@ -25,16 +30,81 @@ class Given(eqx.Module):
         return [of_joint(along) if along.index is None else of_joint(along)[along.index][None] for along in self.terms]
 
 
+def check_mechanism(mechanism):
+    """Whether this is one mechanism."""
+    instance(mechanism, Mechanism, "mechanism", "give a linkax.Mechanism, such as your function of parameters returns")
+    for body in mechanism.bodies:
+        if np.shape(body.mass) != ():
+            raise ValueError(
+                f"mechanism is a batch: body {body.name!r} has masses of shape {np.shape(body.mass)}; use jax.vmap, or "
+                "linkax.sweep, for the function that makes it and uses it"
+            )
+    if mechanism.topology.num_speeds == 0:
+        names = ", ".join(map(repr, mechanism.topology.joints))
+        raise ValueError(
+            f"mechanism cannot move, nor be computed: none of its joints {names} does; make one a joint that does"
+        )
+
+
+def check_accuracy(accuracy):
+    """Whether this is one."""
+    presets = "give linkax.DRAFT, BALANCED, PRECISE or linkax.Accuracy(rtol=...)"
+    instance(accuracy, Accuracy, "accuracy", presets)
+
+
+def checked_time(entry, name: str):
+    """One time [s]."""
+    return number(entry, (), f"{name} [s]")
+
+
+def checked_state(mechanism, state) -> State:
+    """A state of a mechanism, in floating-point numbers, finite where they are known."""
+    check_mechanism(mechanism)
+    topology, made = mechanism.topology, "make the state with linkax.assemble"
+    instance(state, State, "state", made)
+    found = []
+    for what, array, slices, size in (
+        ("q", state.q, topology.coordinates, topology.num_coordinates),
+        ("v", state.v, topology.speeds, topology.num_speeds),
+    ):
+        if not (eqx.is_array(array) and jnp.issubdtype(array.dtype, jnp.floating)):
+            array = real(array, f"state.{what}")
+        if array.shape != (size,):
+            raise ValueError(
+                f"state.{what} has shape {array.shape}; this mechanism's tree has {topology.num_coordinates} "
+                f"coordinates and {topology.num_speeds} speeds: {made}"
+            )
+        found.append(array)
+        if (entries := known(array)) is None:
+            continue
+        for (name, taken), kind in zip(slices.items(), topology.joint_types, strict=False):
+            of_joint = f"state.{what} of joint {name!r}"
+            require(entries[taken], lambda x: np.all(np.isfinite(x)), of_joint, "it must be finite")
+            if kind.has_quaternion and what == "q":
+                _check_quaternion(entries[taken], of_joint)
+    return State(*found)
+
+
+def _check_quaternion(coordinates, what):
+    """Whether coordinates begin with a quaternion that is a rotation."""
+    with np.errstate(over="ignore"):
+        turns = lambda entries: 0.0 < np.linalg.norm(entries[:4]) < np.inf
+        require(coordinates, turns, what, "its quaternion is no rotation; give one of length 1, like (1, 0, 0, 0)")
+
+
 def by_joint(mechanism: Mechanism, given, what: str, count) -> Given:
     """Numbers for joints, checked: {joint or (joint, index): number or array}; `count` tells how many a joint has."""
     terms, values = [], []
-    for key, entry in (given or {}).items():
+    given = {} if given is None else given
+    instance(given, Mapping, what, "give {joint: number, ...}")
+    for key, entry in given.items():
         along = term(key, what)
         joint = mechanism.joint(along.joint)
         expected = count(joint) if along.index is None else 1
         if along.index is not None and not 0 <= along.index < len(joint.speed_units):
+            most = len(joint.speed_units)
             raise ValueError(
-                f"{what} of joint {joint.name!r}: index {along.index}; it has {len(joint.speed_units)} speeds"
+                f"{what} of joint {joint.name!r}: index {along.index}; it has {most} speeds, counted from 0"
             )
         scalar = np.ndim(entry) == 0
         if scalar and expected != 1:
@@ -49,8 +119,8 @@ def coordinates_by_joint(mechanism: Mechanism, given, what: str) -> Given:
     found = by_joint(mechanism, given, what, lambda joint: joint.num_coordinates)
     for along, entry in zip(found.terms, found.values, strict=True):
         joint = mechanism.joint(along.joint)
-        if joint.has_quaternion and along.index is None and known(entry) is not None and not np.any(known(entry)[:4]):
-            raise ValueError(f"{what} of joint {joint.name!r} has a quaternion of zeros; no rotation is (1, 0, 0, 0)")
+        if joint.has_quaternion and along.index is None:
+            _check_quaternion(entry, f"{what} of joint {joint.name!r}")
         if joint.has_quaternion and along.index in (0, 1, 2):
             raise ValueError(
                 f"{what} of joint {joint.name!r}: index {along.index} is part of a quaternion; give all of it"

@@ -29,7 +29,13 @@ class RESULTS(diffrax.RESULTS):
     diverged = (
         "A step of fixed size led to numbers that are not finite. Take smaller steps, or let the step size adapt."
     )
-    not_finite = "The initial state, the numbers of the mechanism, or its forces there are not finite."
+    times_out_of_order = (
+        "The times of the run make no sense: t1, saved times and dt0 must be finite, t1 after t0, and saved times in "
+        "rising order between them."
+    )
+    not_finite = (
+        "The initial state, the numbers of the mechanism, or its forces there are not finite; give finite ones."
+    )
 
 
 KNOWN_RESULTS = (
@@ -44,6 +50,7 @@ KNOWN_RESULTS = (
     "not_unique",
     "massless",
     "not_finite",
+    "times_out_of_order",
 )
 
 

@@ -7,20 +7,30 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
+from linkax.equations.configuration import configure
+from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import formulation as named_formulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import all_known, known
+from linkax.model.numbers import all_known, instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.diagnosis import cause
+from linkax.simulation.given import check_accuracy, checked_state, checked_time
 from linkax.simulation.integration import MechanismControl, Problem, Projected
+from linkax.simulation.options import (
+    check_kinds,
+    check_saved_times,
+    check_steps,
+    floating,
+    saved_times,
+    traced_tolerances,
+)
 from linkax.simulation.outset import Outset, depart
-from linkax.simulation.repeat import Repeat, with_tolerances
+from linkax.simulation.repeat import Repeat
 from linkax.simulation.replay import Course, Steps, integrate, is_replayable
 from linkax.simulation.results import ENDED_WELL, RESULTS, SimulationError, result_name
 from linkax.simulation.rows import over_rows
@@ -83,24 +93,32 @@ def simulate(
     far, where the run ends early: loops that do not close, numbers that are not finite,
     `max_steps` reached, a step size that falls to nothing.
     """
-    dtype = jnp.dtype(float if dtype is None else dtype)
-    t0, t1 = _time("t0", t0), _time("t1", t1)
+    dtype, t0, t1 = floating(dtype), checked_time(t0, "t0"), checked_time(t1, "t1")
     if known(t0) is not None and known(t1) is not None and not t1 > t0:
         raise ValueError(f"t1 is {t1} s, t0 is {t0} s; t1 must be larger")
-    _check_state(mechanism, state)
-    if not isinstance(accuracy, Accuracy):
-        raise ValueError(f"accuracy is {accuracy!r}; give linkax.DRAFT, BALANCED, PRECISE or linkax.Accuracy(rtol=...)")
+    state = checked_state(mechanism, state)
+    check_accuracy(accuracy)
+    check_kinds(
+        saveat=saveat,
+        solver=solver,
+        stepsize_controller=stepsize_controller,
+        adjoint=adjoint,
+        event=event,
+        progress_meter=progress_meter,
+    )
     if stepsize_controller is None:
         stepsize_controller = diffrax.PIDController(rtol=accuracy.rtol, atol=accuracy.atol)
     if isinstance(formulation, str):
         formulation = named_formulation(formulation)
-    if not (formulation is None or isinstance(formulation, AbstractFormulation)):
-        raise ValueError(f"formulation is {formulation!r}; give a name, a linkax.ClassicalFormulation, or None")
+    names = "give a name, a linkax.ClassicalFormulation, or None"
+    instance(formulation, AbstractFormulation | None, "formulation", names)
     solver = default_solver(mechanism) if solver is None else solver
+    dt0 = check_steps(solver, stepsize_controller, dt0, max_steps, t0, t1)
+    check_saved_times(saveat, t0, t1, max_steps)
     replayed = adjoint is None and _saves_states(saveat) and is_replayable(solver, saveat, event, max_steps)
     if adjoint is None:
         adjoint = diffrax.ForwardMode() if replayed else diffrax.RecursiveCheckpointAdjoint()
-    control = MechanismControl(_traced_tolerances(stepsize_controller), is_final=replayed)
+    control = MechanismControl(traced_tolerances(stepsize_controller), is_final=replayed)
     # Compiled apart, so that another solver, formulation or saveat compiles no more than it must.
     mechanism, accuracy, outset = _start(mechanism, state, t0, accuracy, dtype)
     found, formulation = _integrate(
@@ -110,7 +128,7 @@ def simulate(
         formulation,
         t0,
         t1,
-        dt0 if dt0 is None else np.asarray(dt0, dtype=np.float64),
+        dt0,
         saveat,
         Projected.around(solver, accuracy, adjoint, control),
         control,
@@ -139,42 +157,6 @@ def fixed_steps(step: float | None, t1: float) -> dict:
         return {}
     most = max(DEFAULT_MAX_STEPS, int(2.0 * t1 / step))
     return {"dt0": step, "stepsize_controller": diffrax.ConstantStepSize(), "max_steps": most}
-
-
-def _time(name, entry):
-    array = jnp.asarray(entry, dtype=float) if isinstance(entry, jax.Array) else np.asarray(entry, dtype=np.float64)
-    if array.shape != () or (known(array) is not None and not np.isfinite(known(array))):
-        raise ValueError(f"{name} is {entry!r}; it must be one finite number of seconds")
-    return array
-
-
-def _check_state(mechanism, state):
-    topology = mechanism.topology
-    for what, array, slices, size in (
-        ("q", state.q, topology.coordinates, topology.num_coordinates),
-        ("v", state.v, topology.speeds, topology.num_speeds),
-    ):
-        if jnp.shape(array) != (size,):
-            raise ValueError(
-                f"state.{what} has shape {jnp.shape(array)}; this mechanism's tree has {topology.num_coordinates} "
-                f"coordinates and {topology.num_speeds} speeds: make the state with linkax.assemble"
-            )
-        for name, taken in slices.items():
-            if known(array) is not None and not np.all(np.isfinite(known(array)[taken])):
-                raise ValueError(f"state.{what} of joint {name!r} is {known(array)[taken].tolist()}; it must be finite")
-
-
-def _traced_tolerances(controller):
-    """Tolerances given as Python floats made arrays, so that another value compiles nothing anew."""
-
-    def traced(tolerance):
-        if not isinstance(tolerance, (int, float)):
-            return tolerance
-        if not (np.isfinite(tolerance) and tolerance >= 0.0):
-            raise ValueError(f"stepsize_controller: a tolerance is {tolerance}; it must be a positive, finite number")
-        return np.asarray(tolerance, dtype=np.float64)
-
-    return with_tolerances(traced, controller)
 
 
 class _OnManifold(eqx.Module):
@@ -211,7 +193,11 @@ def _cast(tree, dtype):
 def _start(mechanism, state, t0, accuracy, dtype):
     """Mechanism and accuracy in the floating-point type of the run, and the state on the loops."""
     mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
-    return mechanism, accuracy, depart(accuracy.method(dtype), system_of(mechanism, dtype), t0, state)
+    system = system_of(mechanism, dtype)
+    motion = move(configure(system, t0, state.q), state.v)
+    for force in system.forces:
+        force.applied(t0, motion)  # for its errors alone
+    return mechanism, accuracy, depart(accuracy.method(dtype), system, t0, state)
 
 
 def _problem(mechanism, accuracy, outset, formulation) -> Problem:
@@ -260,23 +246,45 @@ def _integrate(
 ):
     dtype = outset.state.q.dtype
     formulation, t0, t1, dt0, saveat, controller = _cast((formulation, t0, t1, dt0, saveat, controller), dtype)
+    in_order, t0, t1, dt0, saveat = _in_order(t0, t1, dt0, saveat)
     problem = _problem(mechanism, accuracy, outset, formulation)
+    problem = eqx.tree_at(lambda p: p.sound, problem, problem.sound & in_order)
     if saveat is None:
         saveat = diffrax.SaveAt(ts=jnp.linspace(t0, t1, DEFAULT_SAVES, dtype=dtype))
     if not _saves_states(saveat):
         saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))
     y0 = problem.packed(outset.state.q, outset.state.v)
     event = _wrapped_event(event)
-    integration = _Integration(outset, dt0, saveat, solver, controller, adjoint, event, progress_meter, max_steps)
+    integration = _Integration(
+        outset, in_order, dt0, saveat, solver, controller, adjoint, event, progress_meter, max_steps
+    )
     if replayed:
         return integrate(Course(problem, y0, t0, t1, saveat.subs.ts), integration), formulation
     return integration(Course(problem, y0, t0, t1, None), False)[0], formulation
+
+
+def _in_order(t0, t1, dt0, saveat):
+    """Whether traced times make sense, and the times: where they do not, others, from which no step is taken.
+
+    diffrax would raise from inside a program, and for all members of a batch.
+    """
+    right = jnp.isfinite(t0) & (t1 > t0) & jnp.isfinite(t1)
+    right = right if dt0 is None else right & jnp.isfinite(dt0) & (dt0 > 0.0)
+    for ts in saved_times(saveat):
+        right = right & jnp.all(jnp.isfinite(ts)) & jnp.all(jnp.diff(ts) >= 0.0) & (ts[0] >= t0) & (ts[-1] <= t1)
+    either = lambda given, other: jnp.where(right, given, other)
+    subs = saved_times(saveat)
+    if subs:
+        saveat = eqx.tree_at(saved_times, saveat, [jnp.where(right, ts, jnp.zeros_like(ts)) for ts in subs])
+    zero = jnp.zeros_like(t0)
+    return right, either(t0, zero), either(t1, zero + 1.0), None if dt0 is None else either(dt0, zero + 1.0), saveat
 
 
 class _Integration(eqx.Module):
     """diffrax's integration of a course, with all its options."""
 
     outset: Outset
+    in_order: Bool[Array, ""]
     dt0: Any
     saveat: diffrax.SaveAt
     solver: Projected
@@ -315,7 +323,7 @@ class _Integration(eqx.Module):
             progress_meter=self.progress_meter,
         )
         (ts, t_end, *times), (ys, y_end, *states) = found.ts, found.ys
-        result = _result(found.result, self.outset, self.controller.is_adaptive)
+        result = _result(found.result, self.outset, self.in_order, self.controller.is_adaptive)
         closest = found.solver_state[2]
         steps = Steps(times[0], states[0], found.stats["num_accepted_steps"]) if track else None
         return _Found(ts, ys, t_end, y_end, found.stats, result, closest, found.interpolation), steps
@@ -362,7 +370,7 @@ def _derivative(t, y, problem):
     return problem.derivative(t, y)
 
 
-def _result(result, outset, is_adaptive):
+def _result(result, outset, in_order, is_adaptive):
     """The first of what is wrong at the start, else how the integration ended."""
     result = RESULTS.promote(result)
     if not is_adaptive:
@@ -372,13 +380,22 @@ def _result(result, outset, is_adaptive):
     result = RESULTS.where(outset.closed, result, RESULTS.not_closed)
     result = RESULTS.where(outset.massive, result, RESULTS.massless)
     result = RESULTS.where(outset.finite, result, RESULTS.not_finite)
-    return RESULTS.where(outset.assembled, result, RESULTS.not_assembled)
+    result = RESULTS.where(outset.assembled, result, RESULTS.not_assembled)
+    return RESULTS.where(in_order, result, RESULTS.times_out_of_order)
 
 
 def _raise_if_failed(solution, state):
     if result_name(solution.result) in ENDED_WELL:
         return
-    at_start = ("not_finite", "not_assembled", "massless", "not_closed", "no_branch", "not_unique")
+    at_start = (
+        "times_out_of_order",
+        "not_finite",
+        "not_assembled",
+        "massless",
+        "not_closed",
+        "no_branch",
+        "not_unique",
+    )
     before = any(solution.result == getattr(RESULTS, name) for name in at_start)
     when = "before it began" if before else f"at t = {float(solution.t_end):.6g} s"
     raise SimulationError(f"simulation stopped {when}: {RESULTS[solution.result]}{cause(solution, state)}", solution)

@@ -15,8 +15,9 @@ from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import number
+from linkax.model.numbers import known, number, require
 from linkax.simulation.accuracy import BALANCED, Accuracy
+from linkax.simulation.given import check_accuracy, checked_state, checked_time
 from linkax.simulation.instant import Instant, Power, Violation
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
@@ -64,7 +65,9 @@ class Solution(eqx.Module):
     @staticmethod
     def of_state(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = BALANCED) -> "Solution":
         """A solution of one time, to read reactions, energies or accelerations at a `State` on the closed loops."""
-        t = jnp.asarray(t, state.q.dtype)
+        state = checked_state(mechanism, state)
+        check_accuracy(accuracy)
+        t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
         return Solution(
             mechanism=mechanism,
             accuracy=accuracy,
@@ -222,6 +225,7 @@ class Solution(eqx.Module):
                 "error_estimate needs the solution of a run that saved states: from linkax.simulate, "
                 "without SaveAt(fn=...)"
             )
+        require(number(factor, (), "factor"), lambda x: 0.0 < x < 1.0, "factor", "it must lie between 0 and 1")
         return _difference(self, (lambda solution: solution.q) if reading is None else reading, factor)
 
     def passages(self) -> Passages:
@@ -237,6 +241,9 @@ class Solution(eqx.Module):
         """The state at a time [s] between the steps; needs `saveat=SaveAt(dense=True)`."""
         if self.interpolation is None:
             raise ValueError("evaluate needs a dense solution; simulate with saveat=diffrax.SaveAt(dense=True)")
+        t, first, last = number(t, (), "t [s]"), known(self.interpolation.t0), known(self.t_end)
+        if first is not None and last is not None and first.shape == ():
+            require(t, lambda t: first <= t <= last, "t [s]", f"give a time of the run, from {first} s to {last} s")
         return _evaluate(dataclasses.replace(self, repeat=None), t)
 
     def _of_constraint(self, function, name):
