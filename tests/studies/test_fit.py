@@ -106,7 +106,7 @@ def test_physical_inertia_is_that_of_a_body():
         assert mass > 0.0
         assert moments[0] > 0.0
         assert moments[2] <= (moments[0] + moments[1]) * (1.0 + 1e-9)
-    with pytest.raises(ValueError, match="no body with extent"):
+    with pytest.raises(ValueError, match="no body"):
         lx.PhysicalInertia(1.0, inertia=[1.0, 1.0, 3.0])
 
 

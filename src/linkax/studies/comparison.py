@@ -17,8 +17,10 @@ from linkax.formulations.named import COMPARED
 from linkax.formulations.named import formulation as named
 from linkax.formulations.shared_program import in_shared_programs
 from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import instance, number, require, whole_number
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.diagnosis import cause
+from linkax.simulation.given import checked_state, checked_time
 from linkax.simulation.results import RESULTS, result_name
 from linkax.simulation.simulate import DEFAULT_SAVES, fixed_steps, simulate
 from linkax.simulation.solution import Solution
@@ -119,6 +121,9 @@ def compare(
 
     **Raises:** `ValueError` for an unknown name; `SimulationError` where the paper's formulation cannot do the motion.
     """
+    state, t1 = checked_state(mechanism, state), float(checked_time(t1, "t1"))
+    _check_points(mechanism, points)
+    _check_asked(t1, steppings, formulations, bound, repeats)
     chosen = dict(formulations) if isinstance(formulations, Mapping) else {name: named(name) for name in formulations}
     classical = {name: entry for name, entry in chosen.items() if isinstance(entry, ClassicalFormulation)}
     chosen |= dict(zip(classical, in_shared_programs(list(classical.values())), strict=True))
@@ -156,6 +161,28 @@ def compare(
             trials.append(_trial(name, stepping, found, seconds, apart, bound, reference, passages, state))
     uncertainty = float(np.max(_apart(positions(other), answer)))
     return Comparison("reference run" if known is None else "closed form", uncertainty, bound, passages, trials)
+
+
+def _check_points(mechanism, points):
+    if not isinstance(points, Mapping) or not points:
+        raise ValueError(f"points are {points!r}; give {{name: (body, frame of the body or None)}}")
+    for body, at in points.values():
+        found = mechanism.body(body)
+        if at is not None:
+            found.at(at)
+
+
+def _check_asked(t1, steppings, formulations, bound, repeats):
+    require(np.asarray(t1), lambda t: t > 0.0, "t1 [s]", "it must be positive")
+    whole_number(repeats, "repeats")
+    if bound is not None:
+        require(number(bound, (), "bound [m]"), lambda x: x > 0.0, "bound [m]", "it must be positive")
+    if not isinstance(steppings, Sequence) or not steppings:
+        raise ValueError(f"steppings are {steppings!r}; give a list of linkax.Stepping(solver, rtol=...)")
+    for stepping in steppings:
+        instance(stepping, Stepping, "an entry of steppings", "give a linkax.Stepping(solver, rtol=...)")
+    if not isinstance(formulations, Mapping | Sequence) or isinstance(formulations, str) or not formulations:
+        raise ValueError(f"formulations are {formulations!r}; give a list of names, or {{name: formulation}}")
 
 
 def _timed(run, repeats):

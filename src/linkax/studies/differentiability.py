@@ -12,6 +12,7 @@ from linkax.analysis.mobility import row_names
 from linkax.equations.configuration import configure
 from linkax.equations.loops import immobile_residual, jacobian, residual
 from linkax.equations.system import system_of
+from linkax.model.numbers import instance
 from linkax.simulation.passages import singular_states
 from linkax.simulation.results import ENDED_WELL, result_name
 from linkax.simulation.solution import Solution
@@ -61,6 +62,7 @@ def differentiability(function: Callable, params: Any) -> Differentiability:
     **Raises:** `ValueError` for a function that returns no `Solution`, a batch, or one of a run that failed, and for
     saved times too far apart to show singular configurations.
     """
+    instance(function, Callable, "function", "give a function that returns a linkax.Solution")
     free = FreeParameters.of(params)
     solution = function(free.params(free.start))
     if not isinstance(solution, Solution):

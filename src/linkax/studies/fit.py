@@ -3,6 +3,7 @@
 import json
 import os
 import warnings
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,10 +16,12 @@ import optax
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
-from linkax.simulation.files import written_whole
+from linkax.model.numbers import instance, number, require, whole_number
+from linkax.simulation.files import writable_folder, written_whole
 from linkax.studies.free_parameters import FreeParameters
 from linkax.studies.identity import fingerprint
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
+from linkax.studies.parameters import as_arrays
 from linkax.studies.showing import progress_bar
 from linkax.studies.uncertainty import uncertainty
 
@@ -116,8 +119,10 @@ def fit(
 
     **Warns:** of parameters that the data do not determine.
     """
+    instance(function, Callable, "function", "give a residual or a loss, a function of (params, *args)")
     free = FreeParameters.of(params)
-    args = jax.tree.map(jnp.asarray, tuple(args))
+    args = as_arrays(tuple(instance(args, list | tuple, "args", "give a tuple of what else the function gets")), "args")
+    _check_ending(steps, tolerance, patience)
     shape = eqx.filter_eval_shape(lambda z, args: function(free.params(z), *args), free.start, args)
     is_loss = isinstance(shape, jax.ShapeDtypeStruct) and shape.shape == ()
     kind = "loss" if is_loss else "residual"
@@ -126,6 +131,9 @@ def fit(
     if optimiser is None:
         optimiser = optax.adam(DEFAULT_RATE) if is_loss else LevenbergMarquardt(tolerance, tolerance)
     by_squares = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
+    if not by_squares:
+        known_ones = "give one of optax, such as optax.adam(1e-2), or a least-squares solver of optimistix"
+        instance(optimiser, optax.GradientTransformation, "optimiser", known_ones)
     if by_squares and is_loss:
         raise ValueError("least squares need a residual; this function returns one number, so give an optax optimiser")
     search = (_Squares if by_squares else _Descent)(optimiser, function, free, mode, is_loss)
@@ -156,6 +164,17 @@ def fit(
         len(losses) - 1,
         ended,
         found.spread,
+    )
+
+
+def _check_ending(steps, tolerance, patience):
+    """Whether what ends a search makes sense."""
+    if steps is not None:
+        whole_number(steps, "steps", least=0)
+    if patience is not None:
+        whole_number(patience, "patience")
+    require(
+        number(tolerance, (), "tolerance"), lambda x: x >= 0.0, "tolerance", "it must be zero or more, such as 1e-6"
     )
 
 
@@ -294,9 +313,13 @@ class _Checkpoint(NamedTuple):
 
     @staticmethod
     def of(path, search, z, state, args) -> "_Checkpoint":
+        path = Path(instance(path, str | os.PathLike, "checkpoint", "give the name of a file"))
+        writable_folder(path.parent, f"give another checkpoint than {str(path)!r}")
+        if path.is_dir():
+            raise ValueError(f"checkpoint {str(path)!r} is a folder; give the name of a file")
         text = _step.lower(search, z, state, args).as_text()
         numbers = jax.tree.leaves(eqx.filter((search, z, args), eqx.is_array))
-        return _Checkpoint(Path(os.fspath(path)), search.free.names, fingerprint(text, numbers))
+        return _Checkpoint(path, search.free.names, fingerprint(text, numbers))
 
     def save(self, tree, losses, waited):
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))]
@@ -307,9 +330,13 @@ class _Checkpoint(NamedTuple):
     def load(self, like):
         arrays, static = eqx.partition(like, eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
-        with np.load(self.path) as file:
-            header = json.loads(str(file["header"]))
-            found = [file[f"leaf_{i}"] for i in range(len(file.files) - 1)]
+        try:
+            with np.load(self.path) as file:
+                header = json.loads(str(file["header"]))
+                found = [file[f"leaf_{i}"] for i in range(len(file.files) - 1)]
+        except (AttributeError, EOFError, KeyError, OSError, ValueError, zipfile.BadZipFile) as error:
+            other = f"checkpoint {str(self.path)!r} holds something else than a fit"
+            raise ValueError(f"{other}; give another file, or remove this one") from error
         if header.get("fit") != self.identity:
             raise ValueError(
                 f"checkpoint {str(self.path)!r} holds another fit, of {', '.join(header['names'])} (parameters, their "

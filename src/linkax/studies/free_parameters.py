@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from linkax.model.numbers import real, require
 from linkax.studies.parameters import AbstractParameter
 from linkax.studies.showing import path_parts
 
@@ -97,12 +98,8 @@ def _check(path, leaf):
     if _is_parameter(leaf):
         return
     name = _names(path, ())[0]
-    try:
-        finite = np.all(np.isfinite(np.asarray(leaf, dtype=float)))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"parameter {name!r} is {leaf!r}; give numbers, or Positive, Bounded, ... of them") from error
-    if not finite:
-        raise ValueError(f"parameter {name!r} is {leaf!r}; it must be finite")
+    what = f"parameter {name!r}"
+    require(real(leaf, what), lambda x: np.all(np.isfinite(x)), what, "it must be finite")
 
 
 def _names(path, shape) -> list[str]:

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import known, number
+from linkax.model.bodies import inertia_tensor
+from linkax.model.numbers import number, real, require
 
 
 class AbstractParameter(eqx.Module):
@@ -83,18 +84,17 @@ class PhysicalInertia(AbstractParameter):
     value: Inertia
 
     def __init__(self, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(1.0, 1.0, 1.0)):
-        inertia = np.asarray(inertia, dtype=float)
-        tensor = np.diag(inertia) if inertia.ndim == 1 else inertia
         self.value = Inertia(
             number(mass, (), "PhysicalInertia: mass [kg]"),
             number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]"),
-            number(tensor, (3, 3), "PhysicalInertia: inertia [kg m²]"),
+            inertia_tensor(inertia, "PhysicalInertia: inertia [kg m²]"),
         )
         smallest = np.min(np.linalg.eigvalsh(_pseudo_inertia(*self.value)))
         if not smallest > 0.0:
             raise ValueError(
-                f"PhysicalInertia: no body with extent along all axes has mass {mass} kg and inertia {tensor.tolist()} "
-                "kg m²; all principal moments must be positive, and each smaller than the sum of the other two"
+                f"PhysicalInertia: no body with extent along all axes has mass {mass} kg and inertia "
+                f"{np.asarray(inertia).tolist()} kg m²; all principal moments must be positive, and each smaller than "
+                "the sum of the other two"
             )
 
     @property
@@ -126,8 +126,19 @@ def _pseudo_inertia(mass, center, inertia):
 
 
 def _checked(kind, value, condition, remedy):
-    array = jnp.asarray(value, dtype=float)
-    concrete = known(array)
-    if concrete is not None and not np.all(condition(concrete)):
-        raise ValueError(f"{kind}: value is {concrete.tolist()}; it {remedy}")
-    return array
+    array = jnp.asarray(real(value, f"{kind}: value"))
+    finite = lambda value: np.all(np.isfinite(value) & condition(value))
+    return require(array, finite, f"{kind}: value", f"it {remedy}, and be finite")
+
+
+def as_arrays(tree, what):
+    """A pytree with arrays in place of numbers and lists; `what` names it in errors."""
+
+    def array(path, leaf):
+        try:
+            return jnp.asarray(leaf)
+        except (TypeError, ValueError, OverflowError) as error:
+            name = what + jax.tree_util.keystr(path)
+            raise ValueError(f"{name} is {leaf!r}; give a number or an array of numbers") from error
+
+    return jax.tree.map_with_path(array, tree)

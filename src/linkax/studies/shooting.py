@@ -5,7 +5,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from linkax.model.numbers import instance, real, require
+from linkax.studies.parameters import as_arrays
 
 
 class Shots(NamedTuple):
@@ -38,15 +42,21 @@ def shoot(run: Callable, starts: Any, ts: Float[Array, " n_t"]) -> Shots:
 
     **Raises:** `ValueError` where the times do not fall into so many equal parts.
     """
+    instance(run, Callable, "run", "give a function (start, ts, t1) -> (end, outputs)")
+    starts = as_arrays(starts, "starts")
     sizes = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else 0 for leaf in jax.tree.leaves(starts)}
     if len(sizes) != 1:
-        raise ValueError(f"starts have {sorted(sizes)} motions; all arrays must have the same first axis")
+        raise ValueError(
+            f"starts have {sorted(sizes)} motions; give arrays with the same first axis, one entry per motion"
+        )
     (count,) = sizes
-    ts = jnp.asarray(ts, float)
+    ts = jnp.asarray(real(ts, "times [s]"))
     if ts.ndim != 1 or len(ts) < 2 or count == 0 or len(ts) % count:
         raise ValueError(
             f"{count} starts for times of shape {ts.shape}; give as many times for each motion, such as {count * 10}"
         )
+    in_order = lambda ts: np.all(np.isfinite(ts)) and np.all(np.diff(ts) > 0.0)
+    require(ts, in_order, "times [s]", "give finite times in rising order")
     parts = ts.reshape(count, -1)
     until = jnp.append(parts[1:, 0], 2.0 * ts[-1] - ts[-2])
     ends, outputs = jax.vmap(run)(starts, parts, until)

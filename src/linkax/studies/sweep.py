@@ -2,9 +2,10 @@
 
 import concurrent.futures
 import itertools
+import numbers
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,9 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 
+from linkax.model.numbers import instance, real, whole_number
 from linkax.simulation.results import ENDED_WELL, KNOWN_RESULTS, RESULTS
+from linkax.studies.parameters import as_arrays
 from linkax.studies.showing import progress_bar
 from linkax.studies.sweep_store import SweepStore
 
@@ -95,15 +98,16 @@ def sweep(
 
     **Raises:** `ValueError` for a batch that is none, and for a store of another sweep.
     """
-    params = jax.tree.map(jnp.asarray, params)
+    instance(function, Callable, "function", "give a function of one set of parameters")
+    params = as_arrays(params, "params")
     count = _members(params)
-    devices = list(jax.local_devices()) if devices is None else list(devices)
-    if chunk is not None and not (isinstance(chunk, int) and chunk > 0):
-        raise ValueError(
-            f"chunk is {chunk!r}; it must be a positive integer: members that one device computes together"
-        )
-    if not memory > 0:
+    devices = list(jax.local_devices()) if devices is None else _checked_devices(devices)
+    if chunk is not None:
+        whole_number(chunk, "chunk")
+    if isinstance(memory, bool) or not isinstance(memory, numbers.Real) or not memory > 0:
         raise ValueError(f"memory is {memory!r}; it must be a positive number of bytes")
+    if store is not None:
+        instance(store, str | os.PathLike, "store", "give the name of a folder")
     order = _order(difficulty, params, count, dict(chunk=chunk, memory=memory, devices=devices))
     with progress_bar(count, "member", progress, smoothing=0.05) as bar:
         program = _Program.compiled(function, params, chunk or min(DEFAULT_CHUNK, count), memory, devices)
@@ -124,16 +128,23 @@ def _members(params) -> int:
     return sizes.pop()[0]
 
 
+def _checked_devices(devices):
+    devices = list(devices) if isinstance(devices, Iterable) else [devices]
+    if not devices or not all(isinstance(device, jax.Device) for device in devices):
+        raise ValueError(f"devices are {devices!r}; give a list of jax.local_devices(), or None for all of them")
+    return devices
+
+
 def _order(difficulty, params, count, options):
     """In which order members run: the difficult ones first."""
     if difficulty is None:
         return np.arange(count)
     if callable(difficulty):
         difficulty = sweep(difficulty, params, progress=False, **options).output
-    difficulty = np.asarray(difficulty)
+    difficulty = np.asarray(real(difficulty, "difficulty"))
     if difficulty.shape != (count,):
         raise ValueError(f"difficulty has shape {difficulty.shape}; give one number for each of {count} members")
-    return np.argsort(-np.nan_to_num(difficulty.astype(float), nan=np.inf), kind="stable")
+    return np.argsort(-np.nan_to_num(difficulty, nan=np.inf), kind="stable")
 
 
 def _is_result(node):
