@@ -1,9 +1,17 @@
 """`linkax compare SCENE`: formulations side by side."""
 
 import json
-from pathlib import Path
 
-from linkax.cli.options import Run, add_run_options, end_progress, one_of, positive, progress, steps_in_words
+from linkax.cli.options import (
+    Run,
+    add_run_options,
+    end_progress,
+    one_of,
+    output_folder,
+    positive,
+    progress,
+    steps_in_words,
+)
 from linkax.formulations.named import BASES, COMPARED, TANGENT_SPACE, formulation
 from linkax.simulation.files import written_whole
 from linkax.simulation.report import finite
@@ -40,8 +48,7 @@ def _compare(arguments):
     if arguments.equal == "cost":
         names = {TANGENT_SPACE: None} | names
     mechanism = asked.mechanism.with_all_rows() if arguments.all_rows else asked.mechanism
-    out = Path("linkax-out") / f"compare-{asked.scene.name}" if arguments.out is None else arguments.out
-    out.mkdir(parents=True, exist_ok=True)
+    out = output_folder(arguments.out, f"compare-{asked.scene.name}")
     exact = asked.scene.exact
     found = compare(
         mechanism,

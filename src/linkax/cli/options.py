@@ -9,6 +9,7 @@ import diffrax
 
 import linkax as lx
 from linkax.scenes import scene
+from linkax.simulation.files import writable_folder
 from linkax.simulation.runge_kutta import RungeKutta4
 from linkax.simulation.simulate import default_solver
 
@@ -28,7 +29,7 @@ def add_run_options(parser):
     solvers = f"{', '.join(SOLVERS)} (default: kvaerno5 for scenes with beams, dopri8 for others)"
     parser.add_argument("--solver", type=one_of(SOLVERS), help=solvers)
     parser.add_argument("--dt", type=positive, metavar="S", help="fixed steps [s], instead of ones that adapt")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the files (default: under linkax-out)")
+    parser.add_argument("--out", type=_path, metavar="DIR", help="folder for the files (default: under linkax-out)")
     parser.add_argument("--no-plots", action="store_true", help="write no pictures")
     parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
 
@@ -82,6 +83,17 @@ def one_of(choices):
         return text.lower()
 
     return read
+
+
+def _path(text):
+    if not text:
+        raise argparse.ArgumentTypeError("'' is no folder; give its name")
+    return Path(text)
+
+
+def output_folder(asked: Path | None, name: str) -> Path:
+    """The folder asked for, or one of that name under linkax-out; tried before the run."""
+    return writable_folder(Path("linkax-out") / name if asked is None else asked, "give another by --out")
 
 
 def _changes(assignments):

@@ -2,11 +2,10 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 
-from linkax.cli.options import Run, add_run_options, end_progress, progress, steps_in_words
+from linkax.cli.options import Run, add_run_options, end_progress, output_folder, progress, steps_in_words
 from linkax.formulations.named import TANGENT_SPACE, formulation
 from linkax.simulation.diagnosis import cause
 from linkax.simulation.files import written_whole
@@ -28,8 +27,7 @@ def add_command(commands):
 
 def _simulate(arguments):
     asked, chosen = Run(arguments), formulation(arguments.formulation)
-    out = Path("linkax-out") / asked.scene.name if arguments.out is None else arguments.out
-    out.mkdir(parents=True, exist_ok=True)
+    out = output_folder(arguments.out, asked.scene.name)
     state = asked.initial(asked.mechanism)
     run = simulate_in_segments(
         asked.mechanism,
