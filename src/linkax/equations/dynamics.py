@@ -75,7 +75,7 @@ def _onto_carrier(carrier, carried):
 
 def applied_load(motion: Motion) -> Load:
     """The sum of what all force elements apply."""
-    loads = [force.load(motion.configuration.t, motion) for force in motion.system.forces]
+    loads = [force.applied(motion.configuration.t, motion) for force in motion.system.forces]
     return reduce(Load.plus, loads, Load.none(motion.system))
 
 

@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from linkax.equations.configuration import configure
-from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import formulation as named_formulation
@@ -193,11 +191,7 @@ def _cast(tree, dtype):
 def _start(mechanism, state, t0, accuracy, dtype):
     """Mechanism and accuracy in the floating-point type of the run, and the state on the loops."""
     mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
-    system = system_of(mechanism, dtype)
-    motion = move(configure(system, t0, state.q), state.v)
-    for force in system.forces:
-        force.applied(t0, motion)  # for its errors alone
-    return mechanism, accuracy, depart(accuracy.method(dtype), system, t0, state)
+    return mechanism, accuracy, depart(accuracy.method(dtype), system_of(mechanism, dtype), t0, state)
 
 
 def _problem(mechanism, accuracy, outset, formulation) -> Problem:
