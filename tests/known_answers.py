@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import diffrax
 import numpy as np
+from mechanisms import with_cut
+from scipy.integrate import solve_ivp
 from scipy.special import ellipj, ellipk
 
 import linkax as lx
@@ -32,6 +34,60 @@ def n_four_bar(times, count, gravity=9.81):
     m = 4 * c / (1 + 4 * c)
     sn, cn, _, _ = ellipj(times / 2 * np.sqrt(1 + 4 * c) - ellipk(m), m)
     return np.stack([-2 * cn * sn, 1 - 2 * cn**2], axis=-1)
+
+
+def turning(parameters, forces=None):
+    """Crank-slider of scene "crank-slider" and its state, from its angle and speed; the rod is carried by the slider.
+
+    `forces`: others than those of the scene.
+
+    So a long rod is not in the inertia of a short crank, of which rounding would leave little.
+    """
+    mechanism = with_cut(SCENES["crank-slider"].mechanism(parameters), "crank_pin")
+    if forces is not None:
+        mechanism = lx.Mechanism(mechanism.bodies, mechanism.joints, forces)
+    crank, rod, angle, speed = (parameters[name] for name in ("crank", "rod", "angle", "speed"))
+    inclination, rate = -angle, -speed
+    if crank != rod:
+        inclination = -np.arcsin(crank / rod * np.sin(angle))
+        rate = -crank / rod * np.cos(angle) / np.cos(inclination) * speed
+    distance = crank * np.cos(angle) + rod * np.cos(inclination)
+    slide = -crank * np.sin(angle) * speed - rod * np.sin(inclination) * rate
+    q = {"bearing": angle, "guide": distance, "wrist_pin": -inclination}
+    v = {"bearing": speed, "guide": slide, "wrist_pin": -rate}
+    ordered = lambda of: np.array([of[name] for name in mechanism.topology.coordinates])
+    return mechanism, lx.State(ordered(q), ordered(v))
+
+
+def crank_slider(parameters, times):
+    """Angle and speed of the crank of scene "crank-slider", (2, n_t): one equation, of its energy ½ J(θ) θ̇² + V(θ).
+
+    With equal lengths on the branch on which the slider moves. Start: see `turning`.
+    """
+    crank, rod = parameters["crank"], parameters["rod"]
+    crank_mass, rod_mass, slider_mass = (parameters[f"{name}_mass"] for name in ("crank", "rod", "slider"))
+
+    def rates(_, state):
+        angle, speed = state
+        s, c = np.sin(angle), np.cos(angle)
+        # Of the rod from the guide, by θ: its sine and cosine, first and second derivative.
+        sine, cosine = -crank / rod * s, c if crank == rod else np.sqrt(1.0 - (crank / rod * s) ** 2)
+        first = -1.0 if crank == rod else -crank / rod * c / cosine
+        second = 0.0 if crank == rod else (crank / rod * s + sine * first**2) / cosine
+        # Derivatives of the places of the rod's middle (half) and of the slider (whole).
+        along = lambda part: -crank * s - part * rod * sine * first
+        bend = lambda part: -crank * c - part * rod * (cosine * first**2 + sine * second)
+        across = crank * c + rod / 2.0 * cosine * first
+        across_bend = -crank * s + rod / 2.0 * (cosine * second - sine * first**2)
+        inertia = crank_mass * crank**2 / 3.0 + slider_mass * along(1.0) ** 2
+        inertia += rod_mass * (along(0.5) ** 2 + across**2 + rod**2 / 12.0 * first**2)
+        slope = slider_mass * along(1.0) * bend(1.0)
+        slope += rod_mass * (along(0.5) * bend(0.5) + across * across_bend + rod**2 / 12.0 * first * second)
+        weight = parameters["gravity"] * (crank_mass * crank / 2.0 * c + rod_mass * across)
+        return speed, -(slope * speed**2 + weight) / inertia
+
+    span, start = (0.0, times[-1]), (parameters["angle"], parameters["speed"])
+    return solve_ivp(rates, span, start, method="DOP853", rtol=1e-13, atol=1e-16, t_eval=times).y
 
 
 class Known(NamedTuple):
