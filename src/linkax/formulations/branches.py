@@ -17,6 +17,7 @@ from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.linalg.constrained_solve import Inverse, constrained_solve, invert_apart
 from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.spatial.vectors import length
 
 OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
 
@@ -54,6 +55,12 @@ class Crossing(eqx.Module):
         """The largest of speeds, in radians and lengths of the mechanism."""
         return jnp.max(jnp.abs(v / self.configuration.system.units), initial=0.0)
 
+    def _basis_of_ones(self):
+        """The basis of the null space of J with each direction of size one, whatever the metric that it is in."""
+        basis = self.inverse.basis
+        size = length(basis / self.configuration.system.units[:, None], axis=0)
+        return basis / jnp.where(size > 0.0, size, 1.0)
+
     def off_branch(self, v, scale=1.0) -> Float[Array, " m"]:
         """The part of γ(v, v) outside the range of J: zero for speeds on a branch.
 
@@ -79,7 +86,7 @@ class Crossing(eqx.Module):
         scale = jnp.where(fastest > 0.0, fastest, 1.0)
         direction = v / scale
         # γ = −J̇ v is quadratic in v, so −J̇ w is a quarter of γ(v + w) − γ(v − w). All at once, to compile γ once.
-        basis = self.inverse.basis
+        basis = self._basis_of_ones()
         speeds = jnp.concatenate([direction[:, None], direction[:, None] + basis, direction[:, None] - basis], axis=1)
         outside = self._outside(jax.vmap(self._bias, in_axes=1, out_axes=1)(speeds))
         plus, minus = jnp.split(outside[:, 1:], 2, axis=1)
