@@ -6,6 +6,7 @@ import pytest
 from known_answers import crank_slider, turning
 
 import linkax as lx
+from linkax.scenes import SCENES
 
 PLAIN = {"crank": 1.0, "rod": 3.0, "crank_mass": 1.0, "rod_mass": 1.0, "slider_mass": 1.0}
 PLAIN |= {"gravity": 9.81, "torque": 0.0, "angle": 0.3, "speed": 2.0}
@@ -89,6 +90,17 @@ def test_lengths_mixed_in_one_mechanism(length):
     found = run({"rod": length})
     assert off(found, {"rod": length}) <= MANY_STEPS * ACCURACY.rtol
     assert_closed(found)
+
+
+def test_a_long_rod_that_a_short_crank_carries_is_named():
+    """In the tree's own choice: what joints of the crank move has the inertia of the rod, in which its own is lost."""
+    settings = SCENES["crank-slider"].settings(changes=PLAIN | {"rod": 1e9})
+    mechanism = SCENES["crank-slider"].mechanism(settings)
+    inclination = -np.arcsin(np.sin(settings["angle"]) / 1e9)
+    start = {"bearing": settings["angle"], "guide": 1e9, "crank_pin": inclination - settings["angle"]}
+    q = np.array([start[name] for name in mechanism.topology.coordinates])
+    with pytest.raises(lx.SimulationError, match=r"leaves 0 digits .* 'crank' next to that of 'rod'.*cut=True"):
+        lx.simulate(mechanism, lx.State(q, 0.0 * q), t1=DURATION)
 
 
 # In single precision tolerances are 1e-5.

@@ -18,6 +18,7 @@ from linkax.simulation.outset import MOVES, moving_joints
 from linkax.simulation.results import RESULTS
 
 AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
+LOST = 1e-9  # of an inertia: what is below leaves too few digits of double precision
 NULL = 1e-10  # eigenvalue of a mass matrix of ones
 
 
@@ -34,11 +35,17 @@ def cause(solution, state) -> str:
     if result == RESULTS.not_closed:
         return _open(system, solution.mechanism, t, method.close(system, t, state.q, state.v)[0])
     if result == RESULTS.massless:
-        return f" They are {_listed(massless_bodies(system, method, t, state.q))}."
+        found = massless_bodies(system, method, t, state.q)
+        return f" They are {_listed(found)}." if found else _lost_inertia(system)
     if (result == RESULTS.no_branch) | (result == RESULTS.not_unique):
         basis = Crossing.at(system, t, state.q, method.rank_tolerance).inverse.basis
         return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
-    return _no_acceleration(solution, system, method, t) or _drives(solution, system, t) or _ahead(solution, system, t)
+    return (
+        _no_acceleration(solution, system, method, t)
+        or _drives(solution, system, t)
+        or _ahead(solution, system, t)
+        or _lost_inertia(system)
+    )
 
 
 def _listed(names):
@@ -110,14 +117,44 @@ def _drives(solution, system, t):
 
 
 def _open(system, mechanism, t, q):
-    """Where the loops are open, widest first."""
+    """Where the loops are open."""
+    name, size = _widest(system, mechanism, t, q)
+    return f" Joint {name!r} is open by {size:.3g}, in radians or lengths of the mechanism."
+
+
+def _widest(system, mechanism, t, q):
+    """The joint or constraint at which the loops are widest open, and by how much."""
     gap, topology = gaps(configure(system, t, q)), mechanism.topology
     names = [*topology.joints[topology.num_bodies :], *topology.constraints]
     sizes = np.concatenate(
         [np.maximum(gap.distance / system.length, gap.angle), gap.constraints / system.coupling_unit]
     )
     widest = int(np.argmax(sizes))
-    return f" Joint {names[widest]!r} is open by {sizes[widest]:.3g}, in radians or lengths of the mechanism."
+    return names[widest], float(sizes[widest])
+
+
+def _lost_inertia(system):
+    """A body of which rounding leaves little in the inertia about its joint, next to what it carries far out."""
+    topology, carrier = system.topology, np.array(system.topology.predecessor)
+    offsets = np.stack([system.parent_offset, system.child_offset], axis=1)[: topology.num_bodies]
+    near = np.where(topology.reversed, 1, 0)  # the joint's end on the carrier
+    moved = np.arange(topology.num_bodies)
+    on_carrier, on_itself = offsets[moved, near], offsets[moved, 1 - near]
+    about_joint = lambda place: np.sum((system.center_of_mass - place) ** 2, axis=-1) * system.mass
+    inertia = np.max(np.abs(system.inertia), axis=(1, 2)) + about_joint(on_itself)
+    carried = np.flatnonzero((carrier >= 0) & (inertia > 0.0))
+    arms = np.sum((on_carrier - on_itself[carrier]) ** 2, axis=-1)
+    # What is carried resists the carrier with its mass alone.
+    left = (inertia[carrier] + system.mass * arms)[carried] / inertia[carried]
+    if not len(carried) or not np.min(left) < LOST:
+        return ""
+    body = carried[np.argmin(left)]
+    names = topology.bodies[carrier[body]], topology.bodies[body], topology.joints[body]
+    digits = max(0, round(float(np.log10(np.min(left) / jnp.finfo(system.dtype).eps + 1e-300))))
+    return (
+        f" Rounding leaves {digits} digits of the inertia of body {names[0]!r} next to that of {names[1]!r}, which it "
+        f"carries in the tree; in a loop, cut=True on joint {names[2]!r} lets another body carry it."
+    )
 
 
 def massless_bodies(system, method, t, q):
