@@ -93,6 +93,8 @@ class Crossing(eqx.Module):
         turning = 0.25 * (plus - minus)
 
         def opening(rows, columns):
+            if not rows:
+                return jnp.zeros((), int)
             block = turning[np.ix_(rows, columns)]
             return jnp.sum(jnp.abs(jnp.diagonal(pivoted_qr(block).r)) > OPENING)
 

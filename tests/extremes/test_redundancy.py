@@ -1,0 +1,71 @@
+"""Constraints that are given twice, or nearly twice: redundant, real, or contradicting each other."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import linkax as lx
+
+START = {"a": 1.2, "b": 1.2, "c": 1.2, "a_pin": -1.2, "beside": -np.pi / 2}
+WEIGHT, SPEED, DURATION = 9.81, 1.0, 0.4
+
+
+def parallelogram(excess=0.0, place=0.4, width=1.0):
+    """A coupler on three parallel rods, of which two would do; the third at `place` is longer by `excess` [m].
+
+    The coupler only translates, so that all moves like a pendulum of three rods and a mass at their ends.
+    Another rod hangs beside it, in no loop.
+    """
+    names = ("a", "b", "c")
+    rods = [lx.rod(name, 1.0 + (excess if name == "c" else 0.0), 1.0) for name in names]
+    points = {"a": np.zeros(3), "b": np.array([width, 0.0, 0.0]), "c": np.array([place, 0.0, 0.0])}
+    coupler = lx.RigidBody("coupler", 1.0, points["b"] / 2.0, np.array([0.0, 0.1, 0.1]), points)
+    ends = list(zip(names, rods, strict=True))
+    joints = [lx.Revolute(name, lx.GROUND.at(points[name]), rod.at("base"), axis="z") for name, rod in ends]
+    joints += [lx.Revolute(f"{name}_pin", rod.at("tip"), coupler.at(name), axis="z") for name, rod in ends]
+    beside = lx.rod("beside", 1.0, 1.0)
+    joints.append(lx.Revolute("beside", lx.GROUND, beside.at("base"), axis="z"))
+    return lx.Mechanism([coupler, *rods, beside], joints, [lx.Gravity([0.0, -WEIGHT, 0.0])])
+
+
+def run(mechanism, speeds, accuracy=lx.PRECISE):
+    positions = {name: START[name] for name in mechanism.topology.coordinates}
+    state = lx.assemble(mechanism, {"a": START["a"]}, speeds, guess=positions)
+    return state, lx.simulate(mechanism, state, t1=DURATION, accuracy=accuracy)
+
+
+def pendulum(times):
+    """J = 3 · 1/3 + 1, and weights of 3 / 2 + 1."""
+    rates = lambda _, state: (state[1], -2.5 * WEIGHT * np.cos(state[0]) / 2.0)
+    start = (START["a"], SPEED)
+    return solve_ivp(rates, (0.0, times[-1]), start, method="DOP853", rtol=1e-13, atol=1e-13, t_eval=times).y[0]
+
+
+@pytest.mark.parametrize("excess", [0.0, *(s * 10.0**-digits for digits in (14, 13, 12) for s in (1.0, -1.0))])
+def test_a_rod_too_many(excess):
+    """A length that is off by less than the tolerance opens the loops by as much, and changes nothing else."""
+    mechanism = parallelogram(excess)
+    state, found = run(mechanism, {"a": SPEED})
+    mobility = lx.mobility(mechanism, state)
+    assert mobility.degrees_of_freedom == 1 + 1
+    # Three rows of each of two pins do not move in a plane, and of the others one depends on the rest.
+    assert mobility.num_redundant == 2 * 3 + 1
+    np.testing.assert_allclose(found.joint("a"), pendulum(np.asarray(found.ts)), atol=1e-10)
+    assert found.worst_violation().position <= 2.0 * abs(excess) + 1e-15
+    np.testing.assert_allclose(found.joint("beside"), -np.pi / 2, atol=1e-14)
+
+
+@pytest.mark.parametrize("excess", [s * 10.0**-digits for digits in (8, 7, 6, 5, 4, 3) for s in (1.0, -1.0)])
+def test_a_rod_too_long_does_not_fit(excess):
+    with pytest.raises(lx.AssemblyError, match=r"joint '._pin' does not close: a gap of .* m remains"):
+        run(parallelogram(excess), {"a": SPEED})
+
+
+def test_pivots_in_one_point():
+    """A coupler of no length is free to turn, whatever the rods do."""
+    mechanism = parallelogram(place=0.0, width=0.0)
+    state, found = run(mechanism, {"a": SPEED, "a_pin": 3.0 - SPEED})
+    assert lx.mobility(mechanism, state).degrees_of_freedom == 2 + 1
+    np.testing.assert_allclose(found.joint("a"), pendulum(np.asarray(found.ts)), atol=1e-10)
+    angle = found.joint("a") + found.joint("a_pin")
+    np.testing.assert_allclose(angle, 3.0 * found.ts, atol=1e-10)
