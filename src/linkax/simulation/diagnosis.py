@@ -18,6 +18,7 @@ from linkax.simulation.outset import MOVES, moving_joints
 from linkax.simulation.results import RESULTS
 
 AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
+OPEN_ULPS = 1e3  # that loops are open where constraints contradict each other
 LOST = 1e-9  # of an inertia: what is below leaves too few digits of double precision
 NULL = 1e-10  # eigenvalue of a mass matrix of ones
 
@@ -44,6 +45,7 @@ def cause(solution, state) -> str:
         _no_acceleration(solution, system, method, t)
         or _drives(solution, system, t)
         or _ahead(solution, system, t)
+        or _contradiction(solution, system, t)
         or _lost_inertia(system)
     )
 
@@ -114,6 +116,21 @@ def _drives(solution, system, t):
             asked = [f"{drive.described} of joint {drive.joints[0]!r}" for drive in drives]
             return f" The {' and the '.join(asked)} asks for what the loops do not allow after t = {float(t):.6g} s."
     return ""
+
+
+def _contradiction(solution, system, t):
+    """Loops that stay open where a step failed, by more than rounding."""
+    end = solution.end
+    if solution.result != RESULTS.dt_min_reached or not system.topology.num_rows or not np.all(np.isfinite(end.q)):
+        return ""
+    name, size = _widest(system, solution.mechanism, t, end.q)
+    if size <= OPEN_ULPS * jnp.finfo(system.dtype).eps:
+        return ""
+    return (
+        f" Joint {name!r} stays open by {size:.3g}, in radians or lengths of the mechanism: constraints that are "
+        "nearly redundant contradict each other by so much. Correct lengths and axes, or ask for a tolerance (rtol) "
+        "above it."
+    )
 
 
 def _open(system, mechanism, t, q):
