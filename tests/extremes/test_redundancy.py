@@ -1,5 +1,6 @@
 """Constraints that are given twice, or nearly twice: redundant, real, or contradicting each other."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -79,3 +80,37 @@ def test_pivots_in_one_point():
     np.testing.assert_allclose(found.joint("a"), pendulum(np.asarray(found.ts)), atol=1e-10)
     angle = found.joint("a") + found.joint("a_pin")
     np.testing.assert_allclose(angle, 3.0 * found.ts, atol=1e-10)
+
+
+def door(tilt, fits):
+    """A panel on two hinges of which the upper is tilted; the panel `fits` where it is made for that, at angle zero."""
+    turned = lambda angle: np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    panel = lx.box("panel", [1.0, 0.1, 2.0], 10.0)
+    edge = np.array([-0.5, 0.0, -1.0])
+    top = panel.at(edge + np.array([0.0, 0.0, 1.0]), jnp.asarray(turned(tilt if fits else 0.0)))
+    joints = [
+        lx.Revolute("lower", lx.GROUND, panel.at(edge), axis="z"),
+        lx.Revolute("upper", lx.GROUND.at([0.0, 0.0, 1.0], jnp.asarray(turned(tilt))), top, axis="z", cut=True),
+    ]
+    return lx.Mechanism([panel], joints)
+
+
+@pytest.mark.parametrize("tilt", 10.0 ** np.arange(-8.0, -2.0))
+def test_a_hinge_out_of_line_contradicts_the_other(tilt):
+    with pytest.raises(lx.AssemblyError, match=r"joint 'upper' does not close: a gap of .* rad remains"):
+        lx.assemble(door(tilt, fits=False), {"lower": 0.0})
+
+
+@pytest.mark.parametrize("tilt", 10.0 ** np.arange(-12.0, -2.0))
+def test_a_hinge_at_an_angle_to_the_other_is_redundant_or_real(tilt):
+    """Below the rank tolerance of 1e-6 it takes nothing away; above, the door is stuck and says so."""
+    mechanism = door(tilt, fits=True)
+    state = lx.assemble(mechanism, {"lower": 0.0})
+    stuck = tilt > 1.5e-6
+    assert lx.mobility(mechanism, state).degrees_of_freedom == (0 if stuck else 1)
+    if stuck:
+        with pytest.raises(lx.AssemblyError, match=r"the speed asked of joint 'lower' is missed by 1"):
+            lx.assemble(mechanism, {"lower": 0.0}, {"lower": 1.0})
+    else:
+        turning = lx.assemble(mechanism, {"lower": 0.0}, {"lower": 1.0})
+        np.testing.assert_allclose(turning.v, 1.0, atol=1e-12)

@@ -294,8 +294,8 @@ def _speeds(configuration, held):
     Speeds satisfy J v = b, and γ(v, v) is in the range of J; where the rank of J is constant, the
     smallest do.
 
-    **Returns:** speeds, (n_v,); how far the smallest speeds are from those held, by joint; and
-    how far the speeds are from such a branch, relative to themselves.
+    **Returns:** speeds, (n_v,); how far the smallest speeds that the loops allow are from those held, by
+    joint; and how far the speeds are from such a branch, relative to themselves.
     """
     system = configuration.system
     crossing = Crossing.of(configuration, BALANCED.method(system.dtype).rank_tolerance)
@@ -309,7 +309,9 @@ def _speeds(configuration, held):
     least = asked.least()
     v = _on_branch(asked, least)
     missed = jnp.max(jnp.abs(asked.right - rows @ v), initial=0.0)
-    reached = zip(of_joints(scale * least), held.values, strict=True)
+    # What the loops leave of them: a row that is nearly none opens little, and yet may allow no motion at all.
+    opened = crossing.jacobian @ least - asked.right[: crossing.jacobian.shape[0]]
+    reached = zip(of_joints(scale * (least - crossing.inverse.normal @ opened)), held.values, strict=True)
     misses = Given(held.terms, tuple(found - entry for found, entry in reached))
     return scale * v, misses, jnp.maximum(asked.off_branch(v), missed)
 
