@@ -9,7 +9,6 @@ it. After those the exponents with which times grow. Times are of this machine, 
 
 import itertools
 import math
-import statistics
 import time
 from collections.abc import Iterator
 
@@ -59,7 +58,7 @@ def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
 
 
 def _seconds(run):
-    """Of one evaluation, the median of several loops over as many as take long enough."""
+    """Of one evaluation, the shortest of several loops over as many as take long enough."""
     count = 1
     while True:
         began = time.perf_counter()
@@ -73,7 +72,7 @@ def _seconds(run):
         began = time.perf_counter()
         jax.block_until_ready(run(count))
         times.append(time.perf_counter() - began)
-    return statistics.median(times) / count
+    return min(times) / count
 
 
 def _pinocchio(problem):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jaxlib
 from jax import lax
 
-WHOLE_LOOP_BYTES = 2**20  # read and written by one pass of a loop: the caches of a core
+WHOLE_LOOP_BYTES = 2**22  # read and written by one pass of a loop
 LOOPS = f"--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold={WHOLE_LOOP_BYTES}"
 PRODUCTS = "--xla_cpu_experimental_ynn_fusion_type="
 KNOWS_PRODUCTS = ("0.10",)  # a flag that XLA does not know ends the process

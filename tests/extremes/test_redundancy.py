@@ -1,11 +1,15 @@
 """Constraints that are given twice, or nearly twice: redundant, real, or contradicting each other."""
 
+import copy
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import KINDS, Numbers
 from scipy.integrate import solve_ivp
 
 import linkax as lx
+from linkax.equations.coordinates import neutral, retract
 
 START = {"a": 1.2, "b": 1.2, "c": 1.2, "a_pin": -1.2, "beside": -np.pi / 2}
 WEIGHT, SPEED, DURATION = 9.81, 1.0, 0.4
@@ -114,3 +118,29 @@ def test_a_hinge_at_an_angle_to_the_other_is_redundant_or_real(tilt):
     else:
         turning = lx.assemble(mechanism, {"lower": 0.0}, {"lower": 1.0})
         np.testing.assert_allclose(turning.v, 1.0, atol=1e-12)
+
+
+def renamed(joint, name):
+    other = copy.copy(joint)
+    object.__setattr__(other, "name", name)
+    return other
+
+
+def test_every_type_of_joint_given_three_times():
+    """Rows that are nothing but rounding, of joints that say what the tree says already, leave accelerations alone."""
+    numbers, bodies, once, again = Numbers(3), [], [], []
+    for kind in (kind for kind in KINDS if kind.can_carry):
+        bodies.append(numbers.body(kind.__name__))
+        once.append(numbers.joint(kind, kind.__name__, lx.GROUND, bodies[-1]))
+        again += [renamed(once[-1], f"{kind.__name__}_{number}") for number in (1, 2)]
+    found = []
+    for joints in (once, [*once, *again]):
+        mechanism = lx.Mechanism(bodies, joints, [lx.Gravity([0.0, -WEIGHT, 0.3])])
+        topology, generator = mechanism.topology, np.random.default_rng(0)
+        assert set(topology.joints[: topology.num_bodies]) == {joint.name for joint in once}
+        q = retract(topology, neutral(topology, float), jnp.array(generator.normal(size=topology.num_speeds)))
+        state = lx.State(q, jnp.array(generator.normal(size=topology.num_speeds)))
+        assert lx.mobility(mechanism, state).degrees_of_freedom == topology.num_speeds
+        at = lx.Solution.of_state(mechanism, state)
+        found.append([at.acceleration(body.name) for body in bodies])
+    np.testing.assert_allclose(found[1], found[0], atol=1e-12)

@@ -103,9 +103,9 @@ def four_bar(duration, accuracy):
 @pytest.mark.slow
 def test_ten_thousand_seconds():
     """Some 7000 passages: loops stay closed to rounding, energy drifts in proportion, the phase with its square."""
-    error, energy, worst = four_bar(100.0, lx.PRECISE)
-    later_error, later_energy, later_worst = four_bar(1e4, lx.PRECISE)
-    assert max(later_worst.position, later_worst.velocity) <= 1e-14
-    assert later_energy <= 200.0 * energy
-    assert later_error <= 2e4 * error
-    print(error, energy, worst, later_error, later_energy, later_worst)
+    error, energy, _ = four_bar(100.0, lx.PRECISE)
+    later_error, later_energy, worst = four_bar(1e4, lx.PRECISE)
+    assert max(worst.position, worst.velocity) <= 1e-14
+    # A hundred times as long, and a factor of two.
+    assert later_energy <= 2.0 * 1e2 * energy
+    assert later_error <= 2.0 * 1e4 * error

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from linkax.linalg.chain import chained
-from linkax.linalg.chained_inverse import invert_chain
+from linkax.linalg.chained_inverse import in_cells, invert_chain, product_in_cells, with_identity_metric
 from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.linalg.sparse_products import Placed
 
 TOLERANCE = 1e-9
 
@@ -70,10 +71,19 @@ def system(name, seed=0, massless=False):
 
 
 def both(given, metric, rank_nearby=None):
-    weight = given.mass if metric == "mass" else None
-    at_once = invert(weight, given.jacobian, given.units, TOLERANCE)
-    by_cells = jax.jit(invert_chain, static_argnums=4)
-    return at_once, by_cells(weight, given.jacobian, given.units, TOLERANCE, given.chain, rank_nearby)
+    at_once = invert(given.mass if metric == "mass" else None, given.jacobian, given.units, TOLERANCE)
+    found = blocks(given, given.mass, given.jacobian)
+    if metric == "identity":
+        found = with_identity_metric(found, given.chain, given.units)
+    return at_once, jax.jit(invert_chain, static_argnums=3)(found, given.units, TOLERANCE, given.chain, rank_nearby)
+
+
+def blocks(given, mass, jacobian):
+    return in_cells(given.chain, Placed.whole(jnp.asarray(mass)), Placed.whole(jnp.asarray(jacobian)))
+
+
+def product_of(given):
+    return product_in_cells(blocks(given, given.mass, given.jacobian), given.chain, given.jacobian.shape[::-1])
 
 
 def assert_solved(given, inverse, metric, at_once):
@@ -151,11 +161,16 @@ def test_refinement_with_factors_of_a_system_nearby(name):
     inverse = both(given, "mass")[1]
     unknowns = np.random.default_rng(1).normal(size=len(given.mass) + len(given.jacobian))
     whole = np.block([[given.mass, -given.jacobian.T], [given.jacobian, np.zeros(2 * given.jacobian.shape[:1])]])
-    product = inverse.product(jnp.asarray(given.mass), jnp.asarray(given.jacobian))
+    of = lambda given: product_in_cells(
+        blocks(given, given.mass, given.jacobian), given.chain, given.jacobian.shape[::-1]
+    )
+    product = of(given)
     np.testing.assert_allclose(product(unknowns), whole @ unknowns, atol=1e-12)
     changed = given._replace(mass=1.001 * given.mass, jacobian=0.999 * given.jacobian, rate=0.999 * given.rate)
     at_once, _ = both(changed, "mass")
-    found, _ = constrained_solve(inverse, changed.mass, changed.jacobian, changed.force, changed.rate, sweeps=4)
+    found, _ = constrained_solve(
+        inverse, changed.mass, changed.jacobian, changed.force, changed.rate, 4, product_of(changed)
+    )
     np.testing.assert_allclose(found, at_once.apply(changed.force, changed.rate)[0], atol=1e-9)
 
 
@@ -167,7 +182,9 @@ def test_derivatives_and_batches():
         inverse = inverse_of(mass, jacobian)
         return constrained_solve(inverse, mass, jacobian, given.force, given.rate)[0]
 
-    by_cells = lambda mass, jacobian: invert_chain(mass, jacobian, given.units, TOLERANCE, given.chain)
+    def by_cells(mass, jacobian):
+        return invert_chain(blocks(given, mass, jacobian), given.units, TOLERANCE, given.chain)
+
     at_once = lambda mass, jacobian: invert(mass, jacobian, given.units, TOLERANCE)
     for transform in (jax.jacfwd, jax.jacrev, lambda f: lambda x: jax.vmap(f)(jnp.array([x, 2.0 * x]))):
         found, expected = (transform(lambda x, way=way: acceleration(x, way))(1.3) for way in (by_cells, at_once))

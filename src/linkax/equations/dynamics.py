@@ -21,7 +21,7 @@ from linkax.equations.configuration import (
     over_subtree,
 )
 from linkax.equations.motion import Motion
-from linkax.linalg.sparse_products import constant_product, products_of_pairs
+from linkax.linalg.sparse_products import Placed, constant_product, products_of_pairs
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
@@ -44,6 +44,11 @@ def _shifted(mass, first_moment, arm):
 
 def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
     """Mass matrix M of the tree by composite rigid bodies [kg m², kg m, kg]."""
+    return mass_entries(configuration).dense()
+
+
+def mass_entries(configuration: Configuration) -> Placed:
+    """`mass_matrix` by its entries: those of speeds of which one moves what the other does."""
     system, topology = configuration.system, configuration.system.topology
     above = lambda carried: _onto_carrier(np.array(topology.predecessor), carried)
     arm = configuration.center_of_mass()
@@ -65,7 +70,9 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
     carrier, carried = np.where(carries, down, np.where(carries.T, across, -1)), np.where(carries, across, down)
     twist, wrench = jnp.concatenate([angular, at_anchor], axis=1), jnp.concatenate([moment, momentum], axis=1)
     found = products_of_pairs(carrier, carried, twist, wrench)
-    return found if topology.motion_column is None else by_speed_of(topology, by_speed_of(topology, found).T)
+    if topology.motion_column is None:
+        return found
+    return Placed.whole(by_speed_of(topology, by_speed_of(topology, found.dense()).T))
 
 
 def _onto_carrier(carrier, carried):

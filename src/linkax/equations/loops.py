@@ -19,7 +19,7 @@ from linkax.equations.configuration import Configuration, along_speeds, bodies_o
 from linkax.equations.coordinates import by_speed
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
-from linkax.linalg.sparse_products import constant_product, products_of_pairs
+from linkax.linalg.sparse_products import Placed, constant_product, products_of_pairs
 from linkax.model.ropes import Rope
 from linkax.spatial.rotations import rotate, transpose
 from linkax.spatial.vectors import cross, dot
@@ -130,7 +130,7 @@ def immobile_residual(configuration: Configuration) -> Float[Array, " m_immobile
     return _residual(configuration, immobile_rows(configuration))
 
 
-def _jacobian(configuration: Configuration, rows: Rows):
+def _jacobian(configuration: Configuration, rows: Rows) -> Placed:
     topology = configuration.system.topology
     parent, child, joints = bodies_of_cuts(topology)
     # The twist of each joint at the point where the loop is cut, reached along its own side.
@@ -149,13 +149,13 @@ def _jacobian(configuration: Configuration, rows: Rows):
         jnp.concatenate([turning, moving], axis=1),
         jnp.concatenate([configuration.angular, configuration.linear], axis=1),
     )
-    return by_speed_of(topology, found)
+    return found if topology.motion_column is None else Placed.whole(by_speed_of(topology, found.dense()))
 
 
 def _combination(configuration: Configuration):
     """Values of the rows that combined rows are functions of, and their Jacobian."""
     rows = combined_rows(configuration)
-    return _residual(configuration, rows), _jacobian(configuration, rows)
+    return _residual(configuration, rows), _jacobian(configuration, rows).dense()
 
 
 def _combining_factors(configuration: Configuration, values) -> Float[Array, "n_combined n"]:
@@ -164,18 +164,23 @@ def _combining_factors(configuration: Configuration, values) -> Float[Array, "n_
 
 def jacobian(configuration: Configuration) -> Float[Array, "m n_v"]:
     """J = ∂ċ/∂v."""
+    return jacobian_entries(configuration).dense()
+
+
+def jacobian_entries(configuration: Configuration) -> Placed:
+    """`jacobian` by its entries: those of speeds that move a loop."""
     system = configuration.system
     rows = [_jacobian(configuration, plain_rows(configuration))]
     if system.topology.combining:
         values, slopes = _combination(configuration)
-        rows.append(_combining_factors(configuration, values) @ slopes)
+        rows.append(Placed.whole(_combining_factors(configuration, values) @ slopes))
     if system.constraints:
         slopes = system.coupling
         for row, rope in ropes(system):
             unit_load = rope.load(configuration, 1.0)
             slopes = slopes.at[row].set(along_speeds(configuration, unit_load.force, unit_load.moment))
-        rows.append(slopes / system.coupling_unit[:, None])
-    return jnp.concatenate(rows)
+        rows.append(Placed.whole(slopes / system.coupling_unit[:, None]))
+    return Placed.stacked(rows)
 
 
 def rate(system: System, t) -> Float[Array, " m"]:
@@ -303,7 +308,7 @@ def flips(configuration: Configuration):
     topology = configuration.system.topology
     kinds = topology.joint_types[topology.num_bodies :]
     rows = _chosen(configuration, [(cut, i, i) for cut, kind in enumerate(kinds) for i in kind.aligned_axes], [])
-    cosine, slopes = _residual(configuration, rows), _jacobian(configuration, rows)
+    cosine, slopes = _residual(configuration, rows), _jacobian(configuration, rows).dense()
     apart = cosine < 0.0
     return jnp.where(apart, FLIP_WEIGHT * cosine, 0.0), jnp.where(apart[:, None], FLIP_WEIGHT * slopes, 0.0)
 

@@ -7,25 +7,34 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from linkax.equations.configuration import Configuration, configure
-from linkax.equations.dynamics import mass_matrix
-from linkax.equations.loops import jacobian
+from linkax.equations.dynamics import mass_entries
+from linkax.equations.loops import jacobian_entries
 from linkax.equations.system import System
+from linkax.linalg.chained_inverse import Blocks, in_cells
 from linkax.tracing import traced_once
 
 
 class Coefficients(NamedTuple):
-    """J and M of M v̇ = f + Jᵀλ, J v̇ = γ at a configuration."""
+    """J and M of M v̇ = f + Jᵀλ, J v̇ = γ at a configuration.
+
+    - `blocks`: what the cells of the mechanism's chain have of both, where it has one.
+    """
 
     configuration: Configuration
     jacobian: Float[Array, "m n_v"]
     mass: Float[Array, "n_v n_v"]
+    blocks: Blocks | None
 
 
 @traced_once
 def coefficients(system: System, t, q) -> Coefficients:
     """Loop rows and mass matrix at coordinates q."""
     configuration = configure(system, t, q)
-    return Coefficients(configuration, jacobian(configuration), mass_matrix(configuration))
+    rows, mass, chain = jacobian_entries(configuration), mass_entries(configuration), system.topology.chain
+    # XLA leaves out what is not used.
+    return Coefficients(
+        configuration, rows.dense(), mass.dense(), None if chain is None else in_cells(chain, mass, rows)
+    )
 
 
 class Dynamics(NamedTuple):

@@ -5,6 +5,7 @@ Positions and velocities are corrected along the normal space before the equatio
 formed; accelerations and multipliers follow from the same split.
 """
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -23,11 +24,12 @@ from linkax.formulations.branches import Crossing
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
 from linkax.formulations.linearised import Changes, Moved, moved, unbalanced
 from linkax.formulations.passage import Course, Value, limit
-from linkax.linalg.chained_inverse import ChainedInverse, invert_chain
+from linkax.linalg.chained_inverse import ChainedInverse, invert_chain, product_in_cells, with_identity_metric
 from linkax.linalg.constrained_solve import (
     Inverse,
     constrained_solve,
     invert_apart,
+    saddle_point_product,
     singularity_distance,
     with_mass,
 )
@@ -104,45 +106,60 @@ class TangentSpace(AbstractFormulation):
         """The split as it is found soonest."""
         if instant.configuration.system.topology.chain is None:
             return self._split_at_once(instant)
-        return self._chained(instant, instant.mass if self.metric == "mass" else None)
+        return self._chained(instant, self._blocks(instant))
 
-    def _chained(self, instant: Coefficients, weight) -> ChainedInverse:
+    def _chained(self, instant: Coefficients, blocks) -> ChainedInverse:
         system = instant.configuration.system
-        return invert_chain(
-            weight, instant.jacobian, system.units, self.rank_tolerance, system.topology.chain, self.rank_nearby
-        )
+        return invert_chain(blocks, system.units, self.rank_tolerance, system.topology.chain, self.rank_nearby)
+
+    def _blocks(self, instant: Coefficients):
+        """What cells have of J and of the weight of corrections; None without cells."""
+        system = instant.configuration.system
+        if instant.blocks is None or self.metric == "mass":
+            return instant.blocks
+        return with_identity_metric(instant.blocks, system.topology.chain, system.units)
+
+    def _product(self, instant: Coefficients, weight, blocks):
+        """[[W, -Jᵀ], [J, 0]] as a function of one vector."""
+        if blocks is None:
+            return partial(saddle_point_product, weight, instant.jacobian)
+        return product_in_cells(blocks, instant.configuration.system.topology.chain, instant.jacobian.shape[::-1])
 
     def _for_dynamics(self, split, instant: Coefficients):
         """The inverse with M, for the same split."""
         if self.metric == "mass":
             return split
         if isinstance(split, ChainedInverse):
-            return self._chained(instant, instant.mass)
+            return self._chained(instant, instant.blocks)
         return with_mass(split, instant.mass)
 
     def _solve(self, split, instant, f, gamma, sweeps):
         """v̇ and λ of M v̇ = f + Jᵀλ, J v̇ = γ."""
-        inverse = self._for_dynamics(split, instant)
-        return constrained_solve(inverse, instant.mass, instant.jacobian, f, gamma, sweeps)
+        inverse, product = self._for_dynamics(split, instant), self._product(instant, instant.mass, instant.blocks)
+        return constrained_solve(inverse, instant.mass, instant.jacobian, f, gamma, sweeps, product)
 
     def _on_velocity_level(self, instant, v, split, sweeps):
         """The speeds nearest to v that satisfy J v = b."""
         weight, configuration = self._weight(instant), instant.configuration
         asked = rate(configuration.system, configuration.t)
-        return constrained_solve(split, weight, instant.jacobian, weight @ v, asked, sweeps)[0]
+        product = self._product(instant, weight, self._blocks(instant))
+        momentum = product(jnp.concatenate([v, jnp.zeros_like(asked)]))[: len(v)]
+        return constrained_solve(split, weight, instant.jacobian, momentum, asked, sweeps, product)[0]
 
     def _least_change(self, instant, split, rows, sweeps):
         """The smallest change of coordinates or speeds that changes the linearised rows so much."""
         weight = self._weight(instant)
-        still = jnp.zeros(weight.shape[0], weight.dtype)
-        return constrained_solve(split, weight, instant.jacobian, still, rows, sweeps)[0]
+        still, product = jnp.zeros(weight.shape[0], weight.dtype), self._product(instant, weight, self._blocks(instant))
+        return constrained_solve(split, weight, instant.jacobian, still, rows, sweeps, product)[0]
 
     def _in_tangent_space(self, instant, split, change):
         """The part of a change that keeps the loops closed."""
-        weight = self._weight(instant)
-        along, _ = split.apply(weight @ change, jnp.zeros(instant.jacobian.shape[0], change.dtype))
+        product = self._product(instant, self._weight(instant), self._blocks(instant))
+        none = jnp.zeros(instant.jacobian.shape[0], change.dtype)
+        along, _ = split.apply(product(jnp.concatenate([change, none]))[: len(change)], none)
         # The factors are those of the state before its correction.
-        return along - split.apply(jnp.zeros_like(change), instant.jacobian @ along)[0]
+        opened = product(jnp.concatenate([along, none]))[len(change) :]
+        return along - split.apply(jnp.zeros_like(change), opened)[0]
 
     def _approximated(self, system, t, q, v):
         """One factorisation, at q; then a fixed number of corrections with it."""

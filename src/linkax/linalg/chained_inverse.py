@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from linkax.linalg.chain import Chain
 from linkax.linalg.constrained_solve import independent, ratio
 from linkax.linalg.pivoted_qr import pivoted_qr
-from linkax.linalg.sparse_products import constant_product
+from linkax.linalg.sparse_products import Placed, constant_product
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
 from linkax.spatial.vectors import length
 
@@ -56,23 +56,6 @@ class ChainedInverse(eqx.Module):
     distance: Float[Array, ""]
     definiteness: Float[Array, ""]
 
-    def product(self, mass, jacobian):
-        """[[M, -Jᵀ], [J, 0]] of a system with the same cells, as a function of (a, λ) in one vector."""
-        table, rows, size = self.chain.table, self.chain.row_table, mass.shape[0]
-        blocks = in_cells(self.chain, mass, jacobian)
-        coupled = jnp.pad(blocks.coupling, ((0, 0), (0, 0), (blocks.coupling.shape[1], 0)))
-        own = jnp.concatenate([jnp.swapaxes(blocks.coupling, 1, 2), blocks.own], axis=2)
-        weight = jnp.concatenate([coupled, own], axis=1)
-
-        def product(unknowns):
-            a, multipliers = _read(unknowns[:size], table), _read(unknowns[size:], rows)
-            force = _times(weight, a) - _times(jnp.swapaxes(blocks.rows, 1, 2), multipliers)
-            onto = table.ravel() == np.arange(size)[:, None]
-            along = constant_product(onto, force.reshape(-1))
-            return jnp.concatenate([along, _gathered(_times(blocks.rows, a), rows, jacobian.shape[0])])
-
-        return product
-
     def apply(self, f, gamma):
         """(a, λ) for the system that was inverted."""
         chain, kept = self.chain, self.last.shape[0]
@@ -99,21 +82,21 @@ class ChainedInverse(eqx.Module):
         return a, _gathered(found[:, added:], chain.row_table, gamma.shape[0])
 
 
-def invert_chain(weight, jacobian, units, tolerance, chain: Chain, rank_nearby=None) -> ChainedInverse:
+def invert_chain(blocks: Blocks, units, tolerance, chain: Chain, rank_nearby=None) -> ChainedInverse:
     """Like `linkax.linalg.constrained_solve.invert`, cell by cell; `rank_nearby` of each cell, (k,)."""
-    weight, jacobian, units = lax.stop_gradient((weight, jacobian, units))
-    weight = jnp.diag(units**-2) if weight is None else weight
-    blocks = in_cells(chain, weight * units[:, None] * units[None, :], jacobian * units[None, :])
-    dtype, (cells, rows, width) = jacobian.dtype, blocks.rows.shape
-    kept = blocks.coupling.shape[1]
-    size = jnp.max(length(jacobian * units[None, :]), initial=0.0)
+    blocks, units = lax.stop_gradient((blocks, units))
+    kept_unit, added_unit = (_read(units, table) for table in (chain.kept_table, chain.added_table))
+    absent = jnp.asarray(chain.added_table < 0, units.dtype)
+    blocks = Blocks(
+        rows=blocks.rows * jnp.concatenate([kept_unit, added_unit], axis=1)[:, None, :],
+        coupling=blocks.coupling * kept_unit[:, :, None] * added_unit[:, None, :],
+        own=blocks.own * added_unit[:, :, None] * added_unit[:, None, :] + jax.vmap(jnp.diag)(absent),
+    )
+    dtype, (cells, rows, width), kept = units.dtype, blocks.rows.shape, blocks.coupling.shape[1]
     known = jnp.full(cells, min(rows, width)) if rank_nearby is None else rank_nearby
-    here = _Here(kept, size, tolerance, rank_nearby is not None)
-    absent = jnp.asarray(chain.added_table < 0)
-    own = blocks.own + jax.vmap(jnp.diag)(absent.astype(dtype))
-    cell = (blocks._replace(own=own), jnp.asarray(chain.passed_on, dtype), known)
+    here = _Here(kept, jnp.max(length(blocks.rows)), tolerance, rank_nearby is not None)
     begin = _Passed(jnp.zeros((kept, kept), dtype), jnp.eye(kept, dtype=dtype), jnp.ones(kept, dtype))
-    passed, found = lax.scan(here.eliminate, begin, cell)
+    passed, found = lax.scan(here.eliminate, begin, (blocks, jnp.asarray(chain.passed_on, dtype), known))
     last, definiteness = _definite(passed.metric, passed.size)
     return ChainedInverse(
         chain=chain,
@@ -127,14 +110,36 @@ def invert_chain(weight, jacobian, units, tolerance, chain: Chain, rank_nearby=N
     )
 
 
-def in_cells(chain: Chain, weight, jacobian) -> Blocks:
+def in_cells(chain: Chain, weight: Placed, jacobian: Placed) -> Blocks:
     """The entries of M and J that the cells read."""
-    kept, added, rows = chain.kept_table, chain.added_table, chain.row_table
+    kept, added = chain.kept_table, chain.added_table
     return Blocks(
-        rows=_blocks(jacobian, rows, chain.table),
+        rows=_blocks(jacobian, chain.row_table, chain.table),
         coupling=_blocks(weight, kept, added),
         own=_blocks(weight, added, added),
     )
+
+
+def with_identity_metric(blocks: Blocks, chain: Chain, units) -> Blocks:
+    """The same rows, and instead of M the metric that measures speeds by their units."""
+    own = jax.vmap(jnp.diag)(jnp.where(chain.added_table < 0, 0.0, _read(units, chain.added_table) ** -2))
+    return Blocks(blocks.rows, jnp.zeros_like(blocks.coupling), own)
+
+
+def product_in_cells(blocks: Blocks, chain: Chain, sizes: tuple[int, int]):
+    """[[M, -Jᵀ], [J, 0]] as a function of (a, λ) in one vector, (n,) and (m,) of `sizes`."""
+    table, size = chain.table, sizes[0]
+    coupled = jnp.pad(blocks.coupling, ((0, 0), (0, 0), (blocks.coupling.shape[1], 0)))
+    own = jnp.concatenate([jnp.swapaxes(blocks.coupling, 1, 2), blocks.own], axis=2)
+    weight = jnp.concatenate([coupled, own], axis=1)
+
+    def product(unknowns):
+        a, multipliers = _read(unknowns[:size], table), _read(unknowns[size:], chain.row_table)
+        force = _times(weight, a) - _times(jnp.swapaxes(blocks.rows, 1, 2), multipliers)
+        along = constant_product(table.ravel() == np.arange(size)[:, None], force.reshape(-1))
+        return jnp.concatenate([along, _gathered(_times(blocks.rows, a), chain.row_table, sizes[1])])
+
+    return product
 
 
 class _Passed(NamedTuple):
@@ -256,7 +261,7 @@ def _read(values, table):
 
 def _blocks(matrix, down, across):
     down, across = down[:, :, None], across[:, None, :]
-    return jnp.where((down >= 0) & (across >= 0), matrix[down, across], 0.0)
+    return jnp.where((down >= 0) & (across >= 0), matrix.at(down, across), 0.0)
 
 
 def _gathered(found, table, size):

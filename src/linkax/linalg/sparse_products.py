@@ -4,8 +4,11 @@ What connects the bodies of a large mechanism concerns few of them at a time. Ea
 entries that it needs, where these are few, and as a product of full matrices where they are not.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 SPARSE = 0.25  # of the entries: what is read is slower than what is in order
 LARGE = 256  # entries of a full matrix that are not worth it
@@ -25,19 +28,48 @@ def constant_product(matrix: np.ndarray, values):
     return found.reshape(len(matrix), *values.shape[1:])
 
 
-def products_of_pairs(left: np.ndarray, right: np.ndarray, a, b):
+class Placed(NamedTuple):
+    """A matrix by its entries that can be other than zero.
+
+    - `values`: (k,). `places`: for each entry of the matrix 1 + its place among the values, or 0 where it is zero.
+    """
+
+    values: Float[Array, " k"]
+    places: np.ndarray
+
+    @staticmethod
+    def whole(matrix) -> "Placed":
+        """A matrix of which all entries can be other than zero."""
+        return Placed(jnp.ravel(matrix), 1 + np.arange(matrix.size).reshape(matrix.shape))
+
+    @staticmethod
+    def stacked(parts: "list[Placed]") -> "Placed":
+        """Rows of several, in order."""
+        first = np.cumsum([0, *(len(part.values) for part in parts)])
+        places = [part.places + start * (part.places > 0) for part, start in zip(parts, first, strict=False)]
+        return Placed(jnp.concatenate([part.values for part in parts]), np.concatenate(places))
+
+    def at(self, down, across):
+        """Entries, as NumPy reads them."""
+        nothing = jnp.zeros(1, self.values.dtype)
+        return jnp.concatenate([nothing, self.values])[self.places[down, across]]
+
+    def dense(self):
+        """All entries."""
+        return self.at(slice(None), slice(None))
+
+
+def products_of_pairs(left: np.ndarray, right: np.ndarray, a, b) -> Placed:
     """The matrix of a_i · b_j, vectors (k, d) and (n, d), with i in `left` and j in `right`; zero where i is -1."""
     present = left >= 0
     pairs, source = np.unique((left * len(b) + right)[present], return_inverse=True)
     places = np.zeros(left.shape, dtype=int)
     if _is_worth_it(len(pairs), len(a) * len(b)):
         down, across = np.divmod(pairs, len(b))
-        values = jnp.sum(a[down] * b[across], axis=-1)
         places[present] = 1 + source
-    else:
-        values = jnp.ravel(a @ b.T)
-        places[present] = 1 + pairs[source]
-    return jnp.concatenate([jnp.zeros(1, values.dtype), values])[places]
+        return Placed(jnp.sum(a[down] * b[across], axis=-1), places)
+    places[present] = 1 + pairs[source]
+    return Placed(jnp.ravel(a @ b.T), places)
 
 
 def _is_worth_it(read, entries):
