@@ -119,6 +119,7 @@ SC2 = ["compare", "crank-slider", "--variant", "SC2", "--formulations"]  # singu
 BOTH = "lagrange-multipliers,lagrange-multipliers+projection"
 
 
+@pytest.mark.slow
 def test_compare_at_equal_cost_chooses_among_tolerances(capsys, tmp_path):
     assert main([*SC2, BOTH, "--t1", "0.4", "--equal", "cost", "--out", str(tmp_path), "--json", "--no-plots"]) == 0
     found = json.loads(capsys.readouterr().out)

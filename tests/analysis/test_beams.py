@@ -49,6 +49,7 @@ def roots(condition, guesses):
     return np.array([optimize.brentq(condition, guess - 0.6, guess + 0.6, xtol=1e-14) for guess in guesses])
 
 
+@pytest.mark.slow
 def test_small_deflections():
     deflection = tip(cantilever((0.0, 1e-4, 0.0)))[1]
     np.testing.assert_allclose(deflection, 1e-4 / 3.0, rtol=1e-6)

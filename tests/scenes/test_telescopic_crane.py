@@ -8,6 +8,7 @@ from cranes import REACH, at_rest, chain_of_beams, crane, deflection, main_frequ
 import linkax as lx
 
 
+@pytest.mark.slow
 def test_deflection_against_a_chain_of_beams():
     """In so little gravity that deflections are small."""
     parameters, mechanism, state = crane(gravity=9.81e-3, payload=2000.0, dropped=0.0)

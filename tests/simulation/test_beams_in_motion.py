@@ -17,6 +17,7 @@ def released(damping=0.0):
     return lx.Mechanism([beam, load], joints, [lx.Gravity([0.0, 3.0, -9.81])])
 
 
+@pytest.mark.slow
 def test_energy_of_a_falling_bar():
     """Released from straight; with damping, what is lost is the power of the damping forces."""
     free = lx.simulate(released(), lx.assemble(released()), t1=0.1, solver=diffrax.Dopri8())
@@ -60,6 +61,7 @@ def test_spin_up():
     np.testing.assert_allclose(across[after], 0.0, atol=0.02 * 0.575)
 
 
+@pytest.mark.slow
 def test_a_sleeve_that_slides_over_nodes():
     """At a node it moves like anywhere; falling off a bent beam, it loses no energy."""
     rubber = lx.Material(2e7, 0.45, 1000.0)

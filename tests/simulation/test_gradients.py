@@ -201,6 +201,7 @@ def test_hessian_times_vector():
     np.testing.assert_allclose(product, differences, rtol=1e-5, atol=1e-5 * np.max(np.abs(differences)))
 
 
+@pytest.mark.slow
 def test_second_derivatives_forwards():
     """Of a pendulum by its length l: its motion depends on t / √l alone."""
     gravity, t1, at = 9.81, 1.0, 0.9

@@ -78,6 +78,7 @@ def test_errors_of_many_starts_lie_on_one_curve(starts):
         assert np.max(np.abs(tip[:, :2] - expected)) <= 5.0 * rtol + 1e-11
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_equal_single_runs():
     starts = anywhere()
     together = starts.batch(1e-12)

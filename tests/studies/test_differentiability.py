@@ -49,6 +49,7 @@ def test_before_the_passage_all_is_differentiable():
     assert lx.differentiability(lambda params: crank_slider(params, t1=0.5), NUMBERS).ok
 
 
+@pytest.mark.slow
 def test_lengths_that_contradict_redundant_loops():
     found = lx.differentiability(parallelogram, {"lengths": np.ones(3), "mass": 1.0})
     assert set(found.reasons) == {"lengths[0]", "lengths[1]", "lengths[2]"}

@@ -74,6 +74,7 @@ def test_killed_and_resumed(whole, tmp_path):
     np.testing.assert_array_equal(zarr.open_group(store)["output/angle"][:], whole.output["angle"])
 
 
+@pytest.mark.slow
 def test_two_processes(whole, tmp_path):
     """They share the work over a loopback connection, and each returns the whole."""
     with socket.socket() as listener:
