@@ -168,7 +168,9 @@ def test_bad_states_are_named(reader, case):
 
 
 @pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("value", [None, "crank", crank_slider, lx.Mechanism, 3.0], ids=str.split("none text function class number"))
+@pytest.mark.parametrize(
+    "value", [None, "crank", crank_slider, lx.Mechanism, 3.0], ids=str.split("none text function class number")
+)
 def test_what_is_no_mechanism_is_named(reader, value):
     refused(lambda: READERS[reader](value, STATE), "mechanism", Shown(value))
 
