@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from linkax.linalg.chain import chained
-from linkax.linalg.chained_inverse import in_cells, invert_chain, product_in_cells, with_identity_metric
+from linkax.linalg.chained_inverse import SaddlePointInCells, in_cells, invert_chain, with_identity_metric
 from linkax.linalg.constrained_solve import constrained_solve, invert
 from linkax.linalg.sparse_products import Placed
 
@@ -83,7 +83,7 @@ def blocks(given, mass, jacobian):
 
 
 def product_of(given):
-    return product_in_cells(blocks(given, given.mass, given.jacobian), given.chain, given.jacobian.shape[::-1])
+    return SaddlePointInCells(blocks(given, given.mass, given.jacobian), given.chain, given.jacobian.shape[::-1])
 
 
 def assert_solved(given, inverse, metric, at_once):
@@ -161,10 +161,7 @@ def test_refinement_with_factors_of_a_system_nearby(name):
     inverse = both(given, "mass")[1]
     unknowns = np.random.default_rng(1).normal(size=len(given.mass) + len(given.jacobian))
     whole = np.block([[given.mass, -given.jacobian.T], [given.jacobian, np.zeros(2 * given.jacobian.shape[:1])]])
-    of = lambda given: product_in_cells(
-        blocks(given, given.mass, given.jacobian), given.chain, given.jacobian.shape[::-1]
-    )
-    product = of(given)
+    product = product_of(given)
     np.testing.assert_allclose(product(unknowns), whole @ unknowns, atol=1e-12)
     changed = given._replace(mass=1.001 * given.mass, jacobian=0.999 * given.jacobian, rate=0.999 * given.rate)
     at_once, _ = both(changed, "mass")

@@ -68,7 +68,7 @@ class Case(NamedTuple):
         mechanism = self.start(numbers)[0]
         system = system_of(mechanism, float)
         q, v = jnp.split(y, [mechanism.topology.num_coordinates])
-        configuration, jacobian, mass = coefficients(system, t, q)
+        configuration, jacobian, mass, _ = coefficients(system, t, q)
         motion = move(configuration, v)
         free, reach = (jnp.linalg.solve(mass, right) for right in (generalised_force(motion), jacobian.T))
         multipliers = jnp.linalg.pinv(jacobian @ reach, rtol=1e-9, hermitian=True) @ (gamma(motion) - jacobian @ free)

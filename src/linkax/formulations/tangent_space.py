@@ -5,7 +5,6 @@ Positions and velocities are corrected along the normal space before the equatio
 formed; accelerations and multipliers follow from the same split.
 """
 
-from functools import partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -24,12 +23,12 @@ from linkax.formulations.branches import Crossing
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
 from linkax.formulations.linearised import Changes, Moved, moved, unbalanced
 from linkax.formulations.passage import Course, Value, limit
-from linkax.linalg.chained_inverse import ChainedInverse, invert_chain, product_in_cells, with_identity_metric
+from linkax.linalg.chained_inverse import ChainedInverse, SaddlePointInCells, invert_chain, with_identity_metric
 from linkax.linalg.constrained_solve import (
     Inverse,
+    SaddlePoint,
     constrained_solve,
     invert_apart,
-    saddle_point_product,
     singularity_distance,
     with_mass,
 )
@@ -122,8 +121,8 @@ class TangentSpace(AbstractFormulation):
     def _product(self, instant: Coefficients, weight, blocks):
         """[[W, -Jᵀ], [J, 0]] as a function of one vector."""
         if blocks is None:
-            return partial(saddle_point_product, weight, instant.jacobian)
-        return product_in_cells(blocks, instant.configuration.system.topology.chain, instant.jacobian.shape[::-1])
+            return SaddlePoint(weight, instant.jacobian)
+        return SaddlePointInCells(blocks, instant.configuration.system.topology.chain, instant.jacobian.shape[::-1])
 
     def _for_dynamics(self, split, instant: Coefficients):
         """The inverse with M, for the same split."""

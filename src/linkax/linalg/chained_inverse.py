@@ -126,20 +126,22 @@ def with_identity_metric(blocks: Blocks, chain: Chain, units) -> Blocks:
     return Blocks(blocks.rows, jnp.zeros_like(blocks.coupling), own)
 
 
-def product_in_cells(blocks: Blocks, chain: Chain, sizes: tuple[int, int]):
-    """[[M, -Jᵀ], [J, 0]] as a function of (a, λ) in one vector, (n,) and (m,) of `sizes`."""
-    table, size = chain.table, sizes[0]
-    coupled = jnp.pad(blocks.coupling, ((0, 0), (0, 0), (blocks.coupling.shape[1], 0)))
-    own = jnp.concatenate([jnp.swapaxes(blocks.coupling, 1, 2), blocks.own], axis=2)
-    weight = jnp.concatenate([coupled, own], axis=1)
+class SaddlePointInCells(eqx.Module):
+    """[[M, -Jᵀ], [J, 0]], to be multiplied with (a, λ) in one vector, (n,) and (m,) of `sizes`."""
 
-    def product(unknowns):
-        a, multipliers = _read(unknowns[:size], table), _read(unknowns[size:], chain.row_table)
+    blocks: Blocks
+    chain: Chain = eqx.field(static=True)
+    sizes: tuple[int, int] = eqx.field(static=True)
+
+    def __call__(self, unknowns):
+        blocks, (table, rows), (n, m) = self.blocks, (self.chain.table, self.chain.row_table), self.sizes
+        coupled = jnp.pad(blocks.coupling, ((0, 0), (0, 0), (blocks.coupling.shape[1], 0)))
+        own = jnp.concatenate([jnp.swapaxes(blocks.coupling, 1, 2), blocks.own], axis=2)
+        weight = jnp.concatenate([coupled, own], axis=1)
+        a, multipliers = _read(unknowns[:n], table), _read(unknowns[n:], rows)
         force = _times(weight, a) - _times(jnp.swapaxes(blocks.rows, 1, 2), multipliers)
-        along = constant_product(table.ravel() == np.arange(size)[:, None], force.reshape(-1))
-        return jnp.concatenate([along, _gathered(_times(blocks.rows, a), chain.row_table, sizes[1])])
-
-    return product
+        along = constant_product(table.ravel() == np.arange(n)[:, None], force.reshape(-1))
+        return jnp.concatenate([along, _gathered(_times(blocks.rows, a), rows, m)])
 
 
 class _Passed(NamedTuple):

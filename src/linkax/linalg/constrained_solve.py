@@ -6,9 +6,9 @@ it follow the four blocks of the saddle-point system's inverse, a = T f + G γ, 
 which serve accelerations and corrections alike.
 """
 
-from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,10 +49,15 @@ class Inverse(NamedTuple):
         return a, self.compliance @ gamma - self.normal.T @ f
 
 
-def saddle_point_product(mass, jacobian, unknowns):
-    """[[M, -Jᵀ], [J, 0]] times (a, λ)."""
-    a, multipliers = jnp.split(unknowns, [mass.shape[0]])
-    return jnp.concatenate([mass @ a - jacobian.T @ multipliers, jacobian @ a])
+class SaddlePoint(eqx.Module):
+    """[[M, -Jᵀ], [J, 0]], to be multiplied with (a, λ) in one vector."""
+
+    mass: Float[Array, "n n"]
+    jacobian: Float[Array, "m n"]
+
+    def __call__(self, unknowns):
+        a, multipliers = jnp.split(unknowns, [self.mass.shape[0]])
+        return jnp.concatenate([self.mass @ a - self.jacobian.T @ multipliers, self.jacobian @ a])
 
 
 @traced_once
@@ -250,15 +255,15 @@ def constrained_solve(inverse, mass, jacobian, f, gamma, sweeps: int = 1, produc
     `inverse` is that of a system nearby, or of this one; each sweep of iterative refinement
     multiplies the error by the distance between the two. Derivatives are solves of the same
     system with the right-hand sides df − dM a + dJᵀλ and dγ − dJ a; nothing is differentiated
-    through the pivoting. They hold where the rank of J does not change. `product`: of the system's matrix with
-    (a, λ) in one vector, where there is a quicker one than with the whole M and J.
+    through the pivoting. They hold where the rank of J does not change. `product`: with the system's matrix, where
+    there is a quicker one than `SaddlePoint`.
 
     **Returns:** a, (n,), and λ, (m,); with dependent rows a and Jᵀλ are unique, λ is one of many.
     """
 
     n = mass.shape[0]
 
-    forwards = partial(saddle_point_product, mass, jacobian)
+    forwards = SaddlePoint(mass, jacobian)
     product = forwards if product is None else product
 
     def nearby(right):
