@@ -43,7 +43,7 @@ def _mechanism(numbers):
     return SCENE.mechanism(PROBLEM.settings | numbers)
 
 
-def _simulated(rtol, saveat=None):
+def _simulated(rtol, saveat):
     """A function of the masses of a member; all start alike."""
     _, state = PROBLEM.start()
     accuracy = lx.Accuracy(rtol=rtol)
@@ -64,8 +64,9 @@ def _error(rtol):
 
 def by_linkax() -> Iterator[dict]:
     """As many members as `SIZES` say."""
-    rtol = next(rtol for rtol in TOLERANCES if _error(rtol) < TARGET)
-    told = {"by": "linkax", "setting": f"rtol {rtol:g}", "error": _error(rtol)}
+    tried = ((rtol, _error(rtol)) for rtol in TOLERANCES)
+    rtol, error = next(found for found in tried if found[1] < TARGET)
+    told = {"by": "linkax", "setting": f"rtol {rtol:g}", "error": error}
     jax.clear_caches()
     end = _simulated(rtol, diffrax.SaveAt(t1=True))
     for size in SIZES:

@@ -76,7 +76,7 @@ def _seconds(run):
 
 
 def _pinocchio(problem):
-    """Its microseconds, and the ratio to those of linkax in another row entry."""
+    """Its microseconds, where it is installed."""
     try:
         peer = PEERS["pinocchio"]
     except ModuleNotFoundError:

@@ -51,6 +51,11 @@ class Departure(NamedTuple):
     definiteness: Float[Array, ""]
 
 
+def _of_islands(topology, ranks):
+    """Ranks of cells, (k,), added up for each island."""
+    return jnp.asarray(topology.cells_of_islands, int) @ ranks
+
+
 def _largest(rows):
     return jnp.max(jnp.abs(rows), initial=0.0)
 
@@ -92,7 +97,7 @@ class TangentSpace(AbstractFormulation):
         """`rank_nearby` of the islands."""
         if topology.chain is None or self.rank_nearby is None:
             return self.rank_nearby
-        return jnp.asarray(topology.cells_of_islands, int) @ self.rank_nearby
+        return _of_islands(topology, self.rank_nearby)
 
     def _split_at_once(self, instant: Coefficients) -> Inverse:
         """The split with a basis of the tangent space."""
@@ -246,7 +251,7 @@ class TangentSpace(AbstractFormulation):
             return self._split(coefficients(system, later, closed)).rank
 
         ranks = jnp.max(lax.map(found, jnp.asarray(ALONG, q.dtype)), axis=0)
-        adds_up = jnp.all(jnp.asarray(topology.cells_of_islands, int) @ ranks == rank)
+        adds_up = jnp.all(_of_islands(topology, ranks) == rank)
         return jnp.where(adds_up, ranks, topology.chain.most_independent)
 
     @traced_once

@@ -20,7 +20,7 @@ from linkax.linalg.chain import Chain
 from linkax.linalg.constrained_solve import independent, ratio
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.sparse_products import Placed, constant_product
-from linkax.linalg.triangular import cholesky_inverse_by_elimination
+from linkax.linalg.triangular import cholesky_inverse, upper_inverse
 from linkax.spatial.vectors import length
 
 
@@ -186,7 +186,7 @@ class _Here(NamedTuple):
         triangle = jnp.where(active[:, None] & active[None, :], r[:count, :count], identity)
         chosen = (order[:count, None] == jnp.arange(rows)).astype(dtype)
         # n = P (γ - ...): motion in the normal space that rows ask for.
-        asked = _lower_solve(triangle.T, jnp.where(active[:, None], chosen, 0.0))
+        asked = upper_inverse(triangle).T @ jnp.where(active[:, None], chosen, 0.0)
         # Normal directions last, so that turning the others leaves them as they are.
         q, asked = q[:, ::-1], asked[::-1]
         places = jnp.arange(width)
@@ -242,18 +242,8 @@ def _times(matrices, vectors):
 
 def _definite(metric, size):
     """L⁻¹ of a metric L Lᵀ, and the smallest of the squared diagonal of L relative to what no loss would leave."""
-    root, diagonal = cholesky_inverse_by_elimination(metric)
+    root, diagonal = cholesky_inverse(metric)
     return root, jnp.min(ratio(diagonal**2, size, 0.0), initial=1.0)
-
-
-def _lower_solve(lower, right):
-    """L⁻¹ B by rows, for a small L."""
-
-    def row(k, found):
-        rest = jnp.where(jnp.arange(len(lower)) < k, lower[k], 0.0)
-        return jnp.where((jnp.arange(len(lower)) == k)[:, None], (right[k] - rest @ found) / lower[k, k], found)
-
-    return lax.fori_loop(0, len(lower), row, right)
 
 
 def _read(values, table):

@@ -7,6 +7,8 @@ on a CPU, and cannot be part of a larger kernel there (see `linkax.compiler`).
 import jax.numpy as jnp
 import numpy as np
 
+from linkax.linalg.sparse_products import Placed
+
 
 def placed(onto, places, values):
     """`onto` (n, …) with values at places along its first axis, as many of both; neither needs to be flat."""
@@ -27,4 +29,5 @@ def assembled(shape, parts, dtype):
     for indices, values in parts:
         source[indices] = first + np.arange(values.size).reshape(values.shape)
         first += values.size
-    return jnp.concatenate([jnp.zeros(1, dtype), *(jnp.ravel(values) for _, values in parts)])[source]
+    values = [jnp.ravel(values) for _, values in parts]
+    return Placed(jnp.concatenate([jnp.zeros(0, dtype), *values]), source).dense()

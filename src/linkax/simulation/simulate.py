@@ -264,10 +264,10 @@ def _in_order(t0, t1, dt0, saveat):
     """
     right = jnp.isfinite(t0) & (t1 > t0) & jnp.isfinite(t1)
     right = right if dt0 is None else right & jnp.isfinite(dt0) & (dt0 > 0.0)
-    for ts in saved_times(saveat):
+    subs = saved_times(saveat)
+    for ts in subs:
         right = right & jnp.all(jnp.isfinite(ts)) & jnp.all(jnp.diff(ts) >= 0.0) & (ts[0] >= t0) & (ts[-1] <= t1)
     either = lambda given, other: jnp.where(right, given, other)
-    subs = saved_times(saveat)
     if subs:
         saveat = eqx.tree_at(saved_times, saveat, [jnp.where(right, ts, jnp.zeros_like(ts)) for ts in subs])
     zero = jnp.zeros_like(t0)
