@@ -137,17 +137,29 @@ def by_newton_euler(problem: Problem, times=TIMES) -> np.ndarray:
     return path(description, newton_euler.simulate(description, times), *description.tracked)
 
 
-def problem_key(text: str) -> str:
-    """A key of `PROBLEMS`, for `argparse`."""
-    if text not in PROBLEMS:
-        raise argparse.ArgumentTypeError(f"unknown problem {text!r}; known: {', '.join(PROBLEMS)}")
-    return text
+def add_problems(parser: argparse.ArgumentParser, known=tuple(PROBLEMS)):
+    """Let a command line name problems, by their keys or by their scenes: `chosen(arguments.problems)`."""
+
+    def keys(text):
+        found = [key for key in known if text in (key, PROBLEMS[key].scene)]
+        if not found:
+            names = dict.fromkeys([*known, *(PROBLEMS[key].scene for key in known)])
+            raise argparse.ArgumentTypeError(f"unknown problem {text!r}; known: {', '.join(names)}")
+        return found
+
+    told = f"a scene, or of {', '.join(known)}; default: all"
+    parser.add_argument("problems", nargs="*", type=keys, default=[list(known)], metavar="PROBLEM", help=told)
+
+
+def chosen(problems: list[list[str]]) -> list[str]:
+    """Keys of `PROBLEMS`, each once."""
+    return list(dict.fromkeys(key for keys in problems for key in keys))
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("problems", nargs="*", type=problem_key, metavar="PROBLEM", help="default: all")
-    for key in parser.parse_args().problems or PROBLEMS:
+    add_problems(parser)
+    for key in chosen(parser.parse_args().problems):
         problem = PROBLEMS[key]
         reference = problem.reference()
         apart = {"linkax": np.max(np.abs(problem.by_linkax() - reference))}

@@ -26,11 +26,11 @@ from benchmarks.machine import machine
 from benchmarks.peers import PEERS
 from benchmarks.peers.__main__ import rows as peer_rows
 from benchmarks.peers.runs import timed
-from benchmarks.problems import PROBLEMS, TIMES
+from benchmarks.problems import PROBLEMS, TIMES, add_problems, chosen
 from linkax.simulation.files import written_whole
 from linkax.studies.comparison import evaluations
 
-TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10, 1e-12)
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 SINGLE = 1e-6  # smallest tolerance in single precision
 TARGETS = (1e-3, 1e-6, 1e-9)  # m
 
@@ -178,15 +178,6 @@ def picture(found: list[dict], key: str) -> Figure:
     return figure
 
 
-def _keys(text):
-    """Keys of `PROBLEMS` by a key, or by the name of a scene."""
-    keys = [key for key, problem in PROBLEMS.items() if text in (key, problem.scene)]
-    if not keys:
-        scenes = dict.fromkeys(problem.scene for problem in PROBLEMS.values())
-        raise argparse.ArgumentTypeError(f"unknown scene {text!r}; known: {', '.join([*scenes, *PROBLEMS])}")
-    return keys
-
-
 def _peers(text):
     names = text.split(",")
     unknown = [name for name in names if name not in PEERS]
@@ -201,14 +192,14 @@ def main():
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scenes", nargs="*", type=_keys, metavar="SCENE", help=f"or a key: {', '.join(PROBLEMS)}")
+    add_problems(parser)
     parser.add_argument("--peers", type=_peers, default=[], metavar="NAME,...", help=f"of {', '.join(PEERS)}")
     parser.add_argument("--vary", choices=[*OPTIONS, NOTHING], action="append", help="what to vary; default: all")
     parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write work_precision.json and a picture per problem")
     arguments = parser.parse_args()
     found = []
-    keys = dict.fromkeys(key for keys in arguments.scenes or [list(PROBLEMS)] for key in keys)
+    keys = chosen(arguments.problems)
     for key in keys:
         for row in rows(key, arguments.vary or OPTIONS, arguments.peers):
             found.append(row)

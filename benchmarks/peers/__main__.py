@@ -16,7 +16,7 @@ import jax
 from benchmarks.peers import PEERS
 from benchmarks.peers.kinematics import judge
 from benchmarks.peers.runs import GaveUp
-from benchmarks.problems import PROBLEMS, TIMES, problem_key
+from benchmarks.problems import PROBLEMS, TIMES, add_problems, chosen
 
 
 def rows(problem: str, peers) -> Iterator[dict]:
@@ -65,15 +65,13 @@ def main():
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.peers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    known = [key for key, problem in PROBLEMS.items() if problem.for_peers]
-    told = f"default: all of {', '.join(known)}"
-    parser.add_argument("problems", nargs="*", type=problem_key, metavar="PROBLEM", help=told)
+    add_problems(parser, [key for key, problem in PROBLEMS.items() if problem.for_peers])
     parser.add_argument("--peer", choices=list(PEERS), action="append", help="default: all")
     parser.add_argument("--target", type=float, default=1e-6, help="error of the cheapest runs [m], default 1e-6")
     parser.add_argument("--json", action="store_true", help="print one JSON array of rows, and nothing else")
     arguments = parser.parse_args()
     found = []
-    for problem in arguments.problems or known:
+    for problem in chosen(arguments.problems):
         if not arguments.json:
             print(f"\n{problem}: {PROBLEMS[problem].name}")
         for row in rows(problem, arguments.peer or PEERS):
