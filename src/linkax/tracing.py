@@ -19,6 +19,11 @@ from linkax.compiler import makes_kernels_of_loops
 traced_once = eqx.filter_jit
 
 
+def all_known(tree) -> bool:
+    """Whether no array of a tree is traced by a transformation."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def in_one_kernel(function, sound, *args):
     """function(*args), as one kernel of the CPU where that can be; no numbers where `sound` is false.
 

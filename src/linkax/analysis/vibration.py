@@ -20,12 +20,13 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import all_known, known, whole_number
+from linkax.model.numbers import known, whole_number
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.assembly import CLOSED, LONGEST_STEP
 from linkax.simulation.diagnosis import massless_bodies
 from linkax.simulation.given import checked_state, checked_time
 from linkax.simulation.state import State
+from linkax.tracing import all_known
 
 MOST_STEPS = 200
 AT_REST = 1e-12  # step [rad, lengths of the mechanism] below which the search for an equilibrium ends

@@ -41,11 +41,6 @@ def known(number) -> np.ndarray | None:
     return None if isinstance(number, jax.core.Tracer) else np.asarray(number)
 
 
-def all_known(tree) -> bool:
-    """Whether no array of a tree is traced."""
-    return all(known(leaf) is not None for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array)))
-
-
 def number(entry, shape: tuple[int, ...], what: str):
     """A traced leaf of the given shape in double precision; `what` names it in errors."""
     array = real(entry, what)

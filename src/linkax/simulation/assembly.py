@@ -14,13 +14,13 @@ from linkax.equations.system import System, system_of
 from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import constrained_solve, invert
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import all_known
 from linkax.model.terms import Term
 from linkax.simulation.accuracy import BALANCED
 from linkax.simulation.given import Given, by_joint, check_mechanism, checked_time, coordinates_by_joint
 from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
+from linkax.tracing import all_known
 
 MOST_STEPS = 100
 LONGEST_STEP = 0.7  # radians, or lengths of the mechanism

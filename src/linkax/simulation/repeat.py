@@ -25,8 +25,7 @@ class Repeat(eqx.Module):
     @staticmethod
     def of(simulate, *given) -> "Repeat":
         """From `linkax.simulate`, and as it takes them: state, t0, dt0, solver, step size controller, max_steps."""
-        given = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, given)
-        return Repeat(simulate, *eqx.partition(given, eqx.is_array))
+        return Repeat(simulate, *eqx.partition(given, lambda leaf: isinstance(leaf, jax.Array | np.ndarray)))
 
     def __call__(self, solution, factor):
         """A run at `factor` times its tolerances, or at half its steps, saved at the same times."""

@@ -14,7 +14,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import formulation as named_formulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import all_known, instance, known
+from linkax.model.numbers import instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.diagnosis import cause
 from linkax.simulation.given import check_accuracy, checked_state, checked_time
@@ -34,6 +34,7 @@ from linkax.simulation.results import ENDED_WELL, RESULTS, SimulationError, resu
 from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
+from linkax.tracing import all_known
 
 DEFAULT_SAVES = 201
 DEFAULT_MAX_STEPS = 16**4
