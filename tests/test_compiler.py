@@ -6,11 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from compiled_as_users_do import motion
 
 from linkax.compiler import LOOPS, makes_kernels_of_loops, set_flags
+from linkax.tracing import runs_once
 
 
 @pytest.fixture(scope="module")
@@ -46,3 +48,19 @@ def test_flags_that_are_given_stay(monkeypatch):
     set_flags()
     assert LOOPS not in os.environ["XLA_FLAGS"]
     assert os.environ["XLA_FLAGS"].startswith("--xla_backend_extra_options=something --xla_cpu_enable_fast_math=false")
+
+
+def test_what_runs_once_has_no_part_in_transformations_of_others():
+    @runs_once
+    def double(x):
+        return 2.0 * x
+
+    def plus_six(x):
+        six = double(np.asarray(3.0))
+        assert not isinstance(six, jax.core.Tracer)
+        return x + six
+
+    assert jax.jit(plus_six)(1.0) == 7.0
+    assert jax.jit(double)(1.0) == 2.0
+    assert jax.grad(double)(1.0) == 2.0
+    np.testing.assert_array_equal(jax.vmap(double)(np.arange(3.0)), [0.0, 2.0, 4.0])

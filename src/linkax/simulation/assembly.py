@@ -20,7 +20,7 @@ from linkax.simulation.given import Given, by_joint, check_mechanism, checked_ti
 from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
-from linkax.tracing import all_known
+from linkax.tracing import all_known, runs_once
 
 MOST_STEPS = 100
 LONGEST_STEP = 0.7  # radians, or lengths of the mechanism
@@ -336,7 +336,7 @@ def _found_jvp(primals, changes):
     return q, rates(topology, q, jnp.where(_size(rows) <= CLOSED, along, 0.0))
 
 
-@eqx.filter_jit
+@runs_once
 def _assemble(mechanism, positions, speeds, guess, t):
     system = system_of(mechanism, jnp.result_type(float))
     topology = system.topology

@@ -34,7 +34,7 @@ from linkax.simulation.results import ENDED_WELL, RESULTS, SimulationError, resu
 from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
-from linkax.tracing import all_known
+from linkax.tracing import all_known, runs_once
 
 DEFAULT_SAVES = 201
 DEFAULT_MAX_STEPS = 16**4
@@ -188,7 +188,7 @@ def _cast(tree, dtype):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if floating(leaf) else leaf, tree)
 
 
-@eqx.filter_jit
+@runs_once
 def _start(mechanism, state, t0, accuracy, dtype):
     """Mechanism and accuracy in the floating-point type of the run, and the state on the loops."""
     mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
