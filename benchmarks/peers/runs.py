@@ -8,8 +8,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 LONGEST = 20.0  # seconds; a run that takes longer is given up
-SHORT = 2.0  # seconds; a run that takes less is timed by the median of several
-REPEATS = 3
+SHORT = 0.4  # seconds; a run that takes less is timed by the median of as many as fit
+REPEATS = 3  # at least, of runs that do not take `LONG`
+LONG = 2.0  # seconds
 
 Result = TypeVar("Result")
 
@@ -52,9 +53,9 @@ class Deadline:
 
 
 def timed(function: Callable[[], Result]) -> tuple[Result, float]:
-    """What a function returns, and the seconds it took: the median of `REPEATS` where they are `SHORT`."""
+    """What a function returns, and the seconds it took: the median of several where one is not `LONG`."""
     seconds = []
-    while len(seconds) < (REPEATS if sum(seconds) < SHORT else 1):
+    while sum(seconds) < SHORT or (len(seconds) < REPEATS and sum(seconds) < LONG):
         began = time.perf_counter()
         result = function()
         seconds.append(time.perf_counter() - began)
