@@ -285,7 +285,7 @@ def _change(found, integration, course, changes, motion):
         ts=integration.rows(begin, saved, end),
         t_end=jnp.where(found.t_end == course.t1, end, 0.0),
         ys=integration.rows(_zero(course.y0, changes.y0), motion.saved, motion.end),
-        y_end=motion.end[None],
+        y_end=motion.end,
     )
 
 

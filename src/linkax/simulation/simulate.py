@@ -1,6 +1,5 @@
 """Integration of a mechanism's motion in time."""
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
@@ -137,9 +136,26 @@ def simulate(
         diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
         max_steps,
     )
-    solution = _read(mechanism, accuracy, outset, formulation, found, _saves_states(saveat))
-    repeat = Repeat.of(simulate, state, t0, dt0, solver, stepsize_controller, max_steps)
-    solution = dataclasses.replace(solution, repeat=repeat)
+    saves = _saves_states(saveat)
+    times, values = (found.ts, found.t_end), (found.ys, found.y_end)
+    end, saved = _closed(mechanism, accuracy, outset, formulation, times, values, saves)
+    solution = Solution(
+        mechanism=mechanism,
+        accuracy=accuracy,
+        formulation=formulation,
+        ts=found.ts,
+        q=saved.q if saves else None,
+        v=saved.v if saves else None,
+        ys=None if saves else found.ys,
+        t_end=found.t_end,
+        end=end,
+        stats=found.stats,
+        result=found.result,
+        rank_nearby=outset.rank,
+        closest=found.closest,
+        interpolation=found.interpolation,
+        repeat=Repeat.of(simulate, state, t0, dt0, solver, stepsize_controller, max_steps),
+    )
     if throw and all_known(solution):
         _raise_if_failed(solution, state)
     return solution
@@ -321,7 +337,7 @@ class _Integration(eqx.Module):
         result = _result(found.result, self.outset, self.in_order, self.controller.is_adaptive)
         closest = found.solver_state[2]
         steps = Steps(times[0], states[0], found.stats["num_accepted_steps"]) if track else None
-        return _Found(ts, ys, t_end, y_end, found.stats, result, closest, found.interpolation), steps
+        return _Found(ts, ys, t_end[0], y_end[0], found.stats, result, closest, found.interpolation), steps
 
     def rows(self, y0, saved, end):
         """What diffrax saves, of values at the start, at saved times, and at the end."""
@@ -331,34 +347,17 @@ class _Integration(eqx.Module):
 
 
 @eqx.filter_jit
-def _read(mechanism, accuracy, outset, formulation, found, states) -> Solution:
-    """The solution, what is saved put on the loops."""
+def _closed(mechanism, accuracy, outset, formulation, times, values, saves) -> tuple[State, State | None]:
+    """The state at the end, and those that are saved, on the loops; infinite where none was saved."""
     problem = _problem(mechanism, accuracy, outset, formulation)
-    ts, ys, t_end, y_end, stats, result, closest, interpolation = found
-    if states:
-        # The end comes first, so that it is in the same part as times that were saved.
-        saved = jnp.concatenate([jnp.ones(1, bool), jnp.isfinite(ts)])
-        closed = over_rows(problem.close, saved, jnp.concatenate([t_end, ts]), jnp.concatenate([y_end, ys]))
-        end, later = State(closed.q[0], closed.v[0]), saved[1:, None]
-        q, v, ys = jnp.where(later, closed.q[1:], jnp.inf), jnp.where(later, closed.v[1:], jnp.inf), None
-    else:
-        q, v, end = None, None, problem.close(t_end[0], y_end[0])
-    return Solution(
-        mechanism=mechanism,
-        accuracy=accuracy,
-        formulation=formulation,
-        ts=ts,
-        q=q,
-        v=v,
-        ys=ys,
-        t_end=t_end[0],
-        end=end,
-        stats=stats,
-        result=result,
-        rank_nearby=outset.rank,
-        closest=closest,
-        interpolation=interpolation,
-    )
+    (ts, t_end), (ys, y_end) = times, values
+    if not saves:
+        return problem.close(t_end, y_end), None
+    # The end comes first, so that it is in the same part as times that were saved.
+    saved = jnp.concatenate([jnp.ones(1, bool), jnp.isfinite(ts)])
+    closed = over_rows(problem.close, saved, jnp.concatenate([t_end[None], ts]), jnp.concatenate([y_end[None], ys]))
+    later = lambda rows: jnp.where(saved[1:, None], rows[1:], jnp.inf)
+    return State(closed.q[0], closed.v[0]), State(later(closed.q), later(closed.v))
 
 
 def _derivative(t, y, problem):
