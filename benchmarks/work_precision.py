@@ -2,8 +2,9 @@
 
 One thing at a time differs from what linkax does by default. A row for each run: largest error of the tracked point
 [m], largest violations of positions and speeds (relative, see `linkax.Solution.worst_violation`), energy gained or lost
-over the largest kinetic energy, steps, evaluations of the equations, seconds to compile, milliseconds to run. Then for
-each target the cheapest run of linkax and of each peer. Times are of this machine, this run: compare ratios.
+over the largest kinetic energy, steps, evaluations of the equations, seconds to compile, milliseconds to run. Then what
+each preset comes to, and for each target the cheapest run of linkax and of each peer. Times are of this machine, this
+run: compare ratios.
 
 The problems are ten seconds long; 201 positions are saved. The telescopic crane has a benchmark of its own.
 """
@@ -33,6 +34,7 @@ from linkax.studies.comparison import evaluations
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 SINGLE = 1e-6  # smallest tolerance in single precision
 TARGETS = (1e-3, 1e-6, 1e-9)  # m
+PRESETS = {"DRAFT": lx.DRAFT, "BALANCED": lx.BALANCED, "PRECISE": lx.PRECISE}
 
 
 class Choice(NamedTuple):
@@ -140,11 +142,10 @@ def cheapest(found: list[dict], key: str, by: str, target: float) -> dict | None
     return min(good, key=lambda row: row["run_ms"]) if good else None
 
 
-def summary(found: list[dict]) -> str:
+def targets(found: list[dict]) -> str:
     """A table in Markdown: for each problem and target the cheapest runs, and how much longer the best peer takes."""
     bys = list(dict.fromkeys(row["by"] for row in found))
-    lines = [f"| problem | error below | {' | '.join(bys)} | best peer over linkax |"]
-    lines.append("|---" * (len(bys) + 3) + "|")
+    lines = _head("problem", "error below", *bys, "best peer over linkax")
     for key in dict.fromkeys(row["problem"] for row in found):
         for target in TARGETS:
             best = {by: cheapest(found, key, by, target) for by in bys}
@@ -153,6 +154,52 @@ def summary(found: list[dict]) -> str:
             ratio = f"{min(others) / best['linkax']['run_ms']:.1f}" if others and best["linkax"] else ""
             lines.append(f"| {key} | {target:g} m | {' | '.join(told)} | {ratio} |")
     return "\n".join(lines)
+
+
+def presets(found: list[dict]) -> str:
+    """A table in Markdown: error, steps and time of each preset, and seconds to compile a first run."""
+    lines = _head("problem", *(f"`{name}`" for name in PRESETS), "compiling")
+    for key in dict.fromkeys(row["problem"] for row in found):
+        own = [row for row in found if (row["problem"], row["value"]) == (key, DEFAULT.value)]
+        at = [row for preset in PRESETS.values() for row in own if row["rtol"] == preset.rtol]
+        told = [f"{row['error']:.0e} m, {row['steps']} steps, {row['run_ms']:.3g} ms" for row in at]
+        lines.append(f"| {key} | {' | '.join(told)} | {max(row['compile_s'] for row in own):.0f} s |")
+    return "\n".join(lines)
+
+
+def choices(found: list[dict]) -> str:
+    """A table in Markdown: error and time of each choice over those by default, at the presets' tolerances."""
+    lines = _head("problem", "choice", *(f"`{name}`" for name in PRESETS))
+    ours = [row for row in found if row["by"] == "linkax"]
+    at = {(row["problem"], row["option"], row["value"], row["rtol"]): row for row in ours}
+    for key, option, value in dict.fromkeys(names[:3] for names in at if names[1]):
+        told = [
+            _against(at.get((key, option, value, rtol)), at[key, DEFAULT.option, DEFAULT.value, rtol])
+            for rtol in (float(preset.rtol) for preset in PRESETS.values())
+        ]
+        lines.append(f"| {key} | {option} {value} | {' | '.join(told)} |")
+    return "\n".join(lines)
+
+
+def _against(row, default):
+    if row is None or row["error"] is None:
+        return "" if row is None else row["result"]
+    return f"error × {row['error'] / default['error']:.2g}, time × {row['run_ms'] / default['run_ms']:.2g}"
+
+
+def _head(*names):
+    return [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+
+
+def report(told: dict) -> str:
+    """All tables, in Markdown, of what `--json` prints."""
+    found = told["rows"]
+    parts = [", ".join(f"{name} {entry}" for name, entry in told["machine"].items()), presets(found)]
+    if any(row["by"] != "linkax" for row in found):
+        parts.append(targets(found))
+    if any(row["option"] for row in found if row["by"] == "linkax"):
+        parts.append(choices(found))
+    return "\n\n".join(parts)
 
 
 def _setting(row):
@@ -196,7 +243,7 @@ def main():
     parser.add_argument("--peers", type=_peers, default=[], metavar="NAME,...", help=f"of {', '.join(PEERS)}")
     parser.add_argument("--vary", choices=[*OPTIONS, NOTHING], action="append", help="what to vary; default: all")
     parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write work_precision.json and a picture per problem")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write rows, tables and pictures there")
     arguments = parser.parse_args()
     found = []
     keys = chosen(arguments.problems)
@@ -208,12 +255,13 @@ def main():
     told = {"machine": machine(), "rows": found}
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)
-        with written_whole(arguments.out / "work_precision.json") as path:
-            path.write_text(json.dumps(told, indent=1))
+        for name, text in (("json", json.dumps(told, indent=1)), ("md", report(told) + "\n")):
+            with written_whole(arguments.out / f"work_precision.{name}") as path:
+                path.write_text(text)
         for key in keys:
             with written_whole(arguments.out / f"{key}.png") as path:
                 picture([row for row in found if row["problem"] == key], key).savefig(path, dpi=110, format="png")
-    print(json.dumps(told) if arguments.json else f"\n{summary(found)}")
+    print(json.dumps(told) if arguments.json else f"\n{report(told)}")
 
 
 def _short(entry):
