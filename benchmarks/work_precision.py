@@ -34,6 +34,7 @@ from linkax.studies.comparison import evaluations
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 SINGLE = 1e-6  # smallest tolerance in single precision
 TARGETS = (1e-3, 1e-6, 1e-9)  # m
+MARKS = "osx^vD+"
 PRESETS = {"DRAFT": lx.DRAFT, "BALANCED": lx.BALANCED, "PRECISE": lx.PRECISE}
 
 
@@ -207,17 +208,24 @@ def _setting(row):
 
 
 def picture(found: list[dict], key: str) -> Figure:
-    """Error against run time of all that ran on a problem."""
+    """Error against run time on a problem: a colour for each simulator and option, a mark for each value."""
     figure = Figure(figsize=(9.0, 5.0), layout="constrained")
     panel = figure.subplots()
-    for by, option, value in dict.fromkeys((row["by"], row["option"], row["value"]) for row in found):
+    lines = list(dict.fromkeys((row["by"], row["option"], row["value"]) for row in found))
+    groups = list(dict.fromkeys(line[:2] for line in lines))
+    for by, option, value in lines:
         own = [row for row in found if (row["by"], row["option"], row["value"]) == (by, option, value)]
         own = [row for row in own if row["error"] is not None]
-        ours = by == "linkax"
-        label = " ".join(filter(None, (by, option, value)))
-        times, errors = [row["run_ms"] for row in own], [max(row["error"], 1e-14) for row in own]
-        width = 2.5 if ours and not option else 1.0
-        panel.plot(times, errors, marker="o" if ours else "x", linewidth=width, markersize=4, label=label)
+        alike = [line for line in lines if line[:2] == (by, option)]
+        panel.plot(
+            [row["run_ms"] for row in own],
+            [max(row["error"], 1e-14) for row in own],
+            color=f"C{groups.index((by, option))}",
+            marker=MARKS[alike.index((by, option, value)) % len(MARKS)],
+            linewidth=2.5 if value == DEFAULT.value else 1.0,
+            markersize=4,
+            label=" ".join(filter(None, (by, option if by == "linkax" else "", value))),
+        )
     panel.set(xscale="log", yscale="log", xlabel="run time [ms]", ylabel="largest error [m]")
     panel.set_title(f"{key}: {PROBLEMS[key].name}, {TIMES[-1]:g} s")
     panel.grid(True, color="#E5E5E5")
