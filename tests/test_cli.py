@@ -131,6 +131,7 @@ def test_compare_at_equal_cost_chooses_among_tolerances(capsys, tmp_path):
         assert trial["error"] < 1e-3
 
 
+@pytest.mark.slow
 def test_compare_tells_when_a_formulation_left_the_motion(capsys, tmp_path):
     assert main([*SC2, BOTH, "--t1", "0.7", "--out", str(tmp_path), "--no-plots"]) == 0
     printed = capsys.readouterr().out

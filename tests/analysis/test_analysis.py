@@ -27,6 +27,7 @@ def test_mobility_in_and_beside_a_singular_configuration():
     assert beside.redundant == {"C": ("α₂", "α₃", "s₁")}
 
 
+@pytest.mark.slow
 def test_derivative_of_the_distance_from_a_singular_configuration():
     scene = SCENES["crank-slider"]
     settings = scene.settings("regular", {"angle": 0.6})

@@ -27,6 +27,7 @@ def placed(origin, turn):
     return lx.simulate(mechanism, state, t1=2.0, accuracy=ACCURACY)
 
 
+@pytest.mark.slow
 def test_neither_place_nor_direction_matters():
     plain = lx.simulate(*turning(SETTINGS), t1=2.0, accuracy=ACCURACY)
     for turn in Rotation.from_rotvec(TURNS).as_matrix():

@@ -126,6 +126,7 @@ def renamed(joint, name):
     return other
 
 
+@pytest.mark.slow
 def test_every_type_of_joint_given_three_times():
     """Rows that are nothing but rounding, of joints that say what the tree says already, leave accelerations alone."""
     numbers, bodies, once, again = Numbers(3), [], [], []

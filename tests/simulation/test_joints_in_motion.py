@@ -45,9 +45,8 @@ LOOPS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [*list(LOOPS)[:1], *(pytest.param(name, marks=pytest.mark.slow) for name in list(LOOPS)[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LOOPS)
 def test_every_joint_type_passes_singular_configurations(name):
     mechanism, state = rhombus(*LOOPS[name])
     found = lx.simulate(mechanism, state, t1=10.0, accuracy=lx.PRECISE)
@@ -103,6 +102,7 @@ def test_ten_cut_joints_move_like_one():
     assert not np.any(found.reaction_unique("C7").force)
 
 
+@pytest.mark.slow
 def test_free_rigid_body_keeps_energy_and_angular_momentum_over_a_hundred_turns():
     moments = np.array([1.0, 2.0, 2.5])
     body = lx.RigidBody("body", 2.0, [0.1, 0.2, -0.1], moments)

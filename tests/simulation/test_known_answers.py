@@ -88,7 +88,7 @@ def test_a_start_in_a_singular_configuration_is_at_distance_zero():
     assert found.singularity_distance()[0] <= 1e-15
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_energy_through_ten_turns(count):
     run = PASSING[f"A02-{count}"]._replace(t1=20.0)
     found = run.simulate(accuracy=lx.PRECISE)

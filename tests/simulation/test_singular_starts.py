@@ -107,6 +107,7 @@ def test_speeds_are_completed_on_a_branch(speeds, slider_speed):
     np.testing.assert_allclose(slider, 2.0 * tip if slider_speed else 0.0 * tip, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_derivatives_of_speeds_on_a_branch():
     """Of x = 2 l cos θ and its like, by the length of both rods and by the speed asked."""
     settings = SCENES["crank-slider"].settings("SC1", {})
@@ -142,6 +143,7 @@ def test_a_start_at_rest_that_is_not_unique_is_found_out():
     assert np.ptp(lx.simulate(mechanism, state, t1=0.5).q, axis=0) == pytest.approx(0.0, abs=1e-15)
 
 
+@pytest.mark.slow
 def test_in_a_batch_a_start_without_branch_harms_no_other():
     starts = anywhere()
     undisturbed = starts.batch(1e-8)

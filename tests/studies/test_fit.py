@@ -60,6 +60,7 @@ def test_covariance_and_intervals_are_those_of_linear_regression():
     np.testing.assert_allclose(found.standard_errors["slope"], np.sqrt(covariance[1, 1]), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say():
     held = 0
     for seed in range(100):
