@@ -87,7 +87,8 @@ PROBLEMS = {
     # Cut in its middle, errors of MuJoCo grow fourfold and those of Pinocchio by many orders of magnitude.
     "M3": Problem("bricard", {}, "P3", singular=False, cuts=("P6",)),
     "pendulum": Problem("pendulum", {}, "bob", singular=False, for_peers=False),
-    "spatial-four-link": Problem("spatial-four-link", {}, "C", singular=True, for_peers=False),
+    # In its default variant it turns uniformly, and steps of any size are exact.
+    "FL3": Problem("spatial-four-link", {"gravity": 9.81, "speed": -1.0}, "C", singular=True, for_peers=False),
     "planar-four-bar": Problem("planar-four-bar", {}, "P3", singular=False, for_peers=False),
     "rigid-crane": Problem("rigid-crane", {}, "tip", singular=False, conserves=False, for_peers=False),
 }
