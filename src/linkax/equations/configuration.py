@@ -1,7 +1,7 @@
 """Poses of all bodies by recursion along the tree, all bodies at once.
 
 Vectors are in ground axes. A sum along the way from ground to each body is a product with the
-topology's `path`; orientations need products along the way (by pointer doubling).
+topology's `path`; only orientations need products along the way (by pointer doubling).
 Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 4, gives the recursions.
 """
 
@@ -165,16 +165,12 @@ def wrapped(angles, is_angle):
 
 def along_path(system: System, edges):
     """Sum over the tree joints from ground to each body: (n_b, …) to (n_b + 1, …)."""
-    for doubling in system.topology.path_factors:
-        edges = constant_product(doubling, edges)
-    return jnp.concatenate([edges, jnp.zeros((1, *edges.shape[1:]), edges.dtype)])
+    return constant_product(system.topology.path, edges)
 
 
 def over_subtree(system: System, bodies):
     """Sum over each body and all that it carries: (n_b, …) to (n_b, …)."""
-    for doubling in system.topology.path_factors:
-        bodies = constant_product(doubling.T, bodies)
-    return bodies
+    return constant_product(system.topology.path[:-1].T, bodies)
 
 
 def by_body(system: System, motions):

@@ -13,7 +13,6 @@ from linkax.model.joints.joint import AbstractJoint, JointKind, Motion
 from linkax.model.terms import Term
 
 GROUND_INDEX = -1
-WHOLE_PATH, SHORT_PATH = 256, 4  # entries of all ways from ground, and bodies on one, that are few
 
 
 class Island(NamedTuple):
@@ -264,22 +263,6 @@ class Topology:
             path[body] = path[carrier]
             path[body, body] = 1.0
         return path
-
-    @cached_property
-    def path_factors(self) -> tuple[np.ndarray, ...]:
-        """Matrices (n_b, n_b) whose product, the first one applied first, is `path` without ground.
-
-        The path itself where bodies are few, or near the ground; else one more for each doubling of its length.
-        """
-        path, count = self.path[:-1], self.num_bodies
-        depth = int(np.max(np.sum(path, axis=1), initial=0.0))
-        if count * depth <= WHOLE_PATH or depth <= SHORT_PATH:
-            return (path,)
-        onto, carrier = [], np.array([*self.predecessor, GROUND_INDEX])
-        while np.any(carrier != GROUND_INDEX):
-            onto.append(np.eye(count) + (carrier[:-1, None] == np.arange(count)))
-            carrier = carrier[carrier]
-        return tuple(onto)
 
     @cached_property
     def loop(self) -> np.ndarray:
