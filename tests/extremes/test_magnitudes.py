@@ -1,5 +1,6 @@
 """Masses, lengths and speeds from very small to very large, alone and in one mechanism."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +8,8 @@ from known_answers import crank_slider, turning
 
 import linkax as lx
 from linkax.scenes import SCENES
+from linkax.simulation.diagnosis import cause
+from linkax.simulation.results import RESULTS
 
 PLAIN = {"crank": 1.0, "rod": 3.0, "crank_mass": 1.0, "rod_mass": 1.0, "slider_mass": 1.0}
 PLAIN |= {"gravity": 9.81, "torque": 0.0, "angle": 0.3, "speed": 2.0}
@@ -101,6 +104,15 @@ def test_a_long_rod_that_a_short_crank_carries_is_named():
     q = np.array([start[name] for name in mechanism.topology.coordinates])
     with pytest.raises(lx.SimulationError, match=r"leaves 0 digits .* 'crank' next to that of 'rod'.*cut=True"):
         lx.simulate(mechanism, lx.State(q, 0.0 * q), t1=DURATION)
+
+
+def test_beams_lose_no_inertia_to_their_nodes():
+    """These have none, and beams bend away from them: what stops a run is not that."""
+    beam = lx.Beam("beam", 2.0, lx.rectangle(0.1, 0.1, lx.Material(2.1e11, 0.3, 7850.0)))
+    mechanism = lx.Mechanism([beam], [lx.Revolute("foot", lx.GROUND, beam, axis="z")])
+    stopped = lx.Solution.of_state(mechanism, lx.assemble(mechanism))
+    stopped = eqx.tree_at(lambda solution: solution.result, stopped, RESULTS.max_steps_reached)
+    assert "inertia" not in cause(stopped, stopped.end)
 
 
 # In single precision tolerances are 1e-5.

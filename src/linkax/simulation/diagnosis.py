@@ -159,10 +159,13 @@ def _lost_inertia(system):
     on_carrier, on_itself = offsets[moved, near], offsets[moved, 1 - near]
     about_joint = lambda place: np.sum((system.center_of_mass - place) ** 2, axis=-1) * system.mass
     inertia = np.max(np.abs(system.inertia), axis=(1, 2)) + about_joint(on_itself)
-    carried = np.flatnonzero((carrier >= 0) & (inertia > 0.0))
+    # Joints that bend have arms that are no constants.
+    straight = np.array([kind.motion is None for kind in topology.joint_types[: topology.num_bodies]])
+    carried = np.flatnonzero((carrier >= 0) & (inertia > 0.0) & straight)
     arms = np.sum((on_carrier - on_itself[carrier]) ** 2, axis=-1)
     # What is carried resists the carrier with its mass alone.
     left = (inertia[carrier] + system.mass * arms)[carried] / inertia[carried]
+    carried, left = carried[left > 0.0], left[left > 0.0]  # what has no inertia loses none
     if not len(carried) or not np.min(left) < LOST:
         return ""
     body = carried[np.argmin(left)]
