@@ -9,6 +9,7 @@ Parts, chosen by `--part`:
 - `derivatives`: of deflection and frequency by section height, modulus and load, against differences.
 - `runs`: every variant over its whole time, how far its loops open, with pictures of tip and load.
 - `cost`: run time against length of motion and number of elements, with growth exponents.
+- `presets`: over ten seconds, the error of the tip's place [m] that each preset estimates, and its cost.
 
 Pictures go into `--out` (default: linkax-out/crane). About half an hour, most of it compiling.
 """
@@ -48,6 +49,8 @@ SAMPLES = 1201
 STIFFER = (1e3, 1e5)  # than steel
 LENGTHS = (0.5, 1.0, 2.0, 4.0)  # of motion [s]
 ELEMENTS = (1, 2, 4)  # of each section
+LONGEST = 10.0  # s
+SAVED = diffrax.SaveAt(ts=np.linspace(0.0, LONGEST, 201))
 
 
 def statics(out):
@@ -172,6 +175,30 @@ def cost(out):
             yield row
 
 
+def presets(out):
+    """A fifth of the load drops; seconds to run once compiled."""
+    _, mechanism, state = crane()
+    for name in ("DRAFT", "BALANCED", "PRECISE"):
+        accuracy = getattr(lx, name)
+        run = lambda accuracy=accuracy: jax.block_until_ready(
+            lx.simulate(mechanism, state, t1=LONGEST, accuracy=accuracy, saveat=SAVED)
+        )
+        times = [time.perf_counter()]
+        for _ in range(2):
+            found = run()
+            times.append(time.perf_counter())
+        first, seconds = np.diff(times)
+        error = jnp.max(found.error_estimate(lambda solution: solution.position("section_3", at="tip")))
+        yield {
+            "preset": name,
+            "rtol": accuracy.rtol,
+            "error": f"{float(error):.1e}",
+            "steps": int(found.stats["num_steps"]),
+            "first_run_s": f"{first:.3g}",
+            "run_s": f"{seconds:.3g}",
+        }
+
+
 PARTS = {
     "deflection": statics,
     "figure-20": figure_20,
@@ -179,6 +206,7 @@ PARTS = {
     "derivatives": derivatives,
     "runs": runs,
     "cost": cost,
+    "presets": presets,
 }
 
 if __name__ == "__main__":

@@ -2,9 +2,10 @@
 
 Each row: speeds and loop rows; microseconds for an evaluation as a step asks for it; what part of that the correction
 of positions and speeds takes; seconds to compile it, and kilobytes that it works in; and Pinocchio's microseconds for
-`constraintDynamics` at the same state, where it is installed. Part `problems`: those of `benchmarks.problems`. Part
-`rows`: N four-bars in a row. Parts `chains` and `rings`: as many bodies, hinged to each other, from ground, and back to
-it. After those the exponents with which times grow. Times are of this machine, this run: compare ratios.
+`constraintDynamics` at the same state, where it is installed. Part `problems`: those of `benchmarks.problems`, and the
+telescopic crane. Part `rows`: N four-bars in a row. Parts `chains` and `rings`: as many bodies, hinged to each other,
+from ground, and back to it. After those the exponents with which times grow. Times are of this machine, this run:
+compare ratios.
 """
 
 import itertools
@@ -95,8 +96,9 @@ def _of_problem(problem):
 
 
 def problems() -> Iterator[dict]:
-    """All problems that other benchmarks use."""
-    for key, problem in PROBLEMS.items():
+    """All problems that other benchmarks use, and one with beams."""
+    with_beams = Problem("telescopic-crane", {}, "tip", singular=False, conserves=False, for_peers=False)
+    for key, problem in (*PROBLEMS.items(), ("telescopic-crane", with_beams)):
         yield {"problem": key, **_of_problem(problem)}
 
 

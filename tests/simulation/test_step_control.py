@@ -6,10 +6,11 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import linkax as lx
-from linkax.simulation.integration import MechanismControl, StepError, placements
+from linkax.simulation.integration import Chord, MechanismControl, StepError, placements
 
 ARGS = SimpleNamespace(
     system=SimpleNamespace(units=jnp.array([1.0, 1e3])),
@@ -149,3 +150,12 @@ def test_implicit_steps_go_on_while_they_converge(rtol):
     state, accuracy = lx.assemble(mechanism, {"hinge": 0.3}), lx.Accuracy(rtol=rtol)
     stats = lx.simulate(mechanism, state, t1=5.0, solver=diffrax.Kvaerno5(), accuracy=accuracy).stats
     assert stats["num_rejected_steps"] < stats["num_accepted_steps"] / 4
+
+
+@pytest.mark.parametrize(("tolerance", "ends"), [(1e-2, True), (1e-4, False)])
+def test_iterations_end_where_rounding_within_the_tolerance_is_left(tolerance, ends):
+    """Of an equation that leaves 1e-3, more than the share of the tolerance that the iterations are to come down to."""
+    noisy = lambda y, _: y - 1.0 + 1e-3 * jnp.sign(y - 1.0)
+    found = optx.root_find(noisy, Chord(0.0, tolerance), jnp.asarray(1.001), max_steps=30, throw=False)
+    assert (found.result == optx.RESULTS.successful) == ends
+    assert found.stats["num_steps"] <= 10 or not ends

@@ -36,6 +36,7 @@ SMALLEST_STEP_ULPS = 4.0
 MOST_RETRIES = 4
 FEASIBLE = 0.1  # of a step's first distance: what any step can keep from a passage
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
+STAGNATES = 0.9  # rate at which they no longer fall
 BEYOND = 1.5  # how far after its end a step may leave a passage, in steps
 
 
@@ -151,7 +152,9 @@ class Chord(diffrax.VeryChord):
         contracts = at_least_two & (rate < 1.0)
         to_come = state.diffsize * jnp.where(contracts, rate / jnp.where(contracts, 1.0 - rate, 1.0), 1.0)
         failed = state.result != optx.RESULTS.successful
-        converged = to_come < self.kappa
+        # Changes that stop falling within the tolerance are rounding, which fast waves make larger than kappa.
+        rounding = at_least_two & (rate >= STAGNATES) & (state.diffsize < 1.0)
+        converged = (to_come < self.kappa) | rounding
         diverged = at_least_two & jnp.logical_not(rate <= DIVERGES) & jnp.logical_not(converged)
         result = optx.RESULTS.where(diverged & jnp.logical_not(failed), optx.RESULTS.nonlinear_divergence, state.result)
         return failed | converged | diverged, result
