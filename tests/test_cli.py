@@ -89,7 +89,7 @@ def test_summary_for_people(capsys, tmp_path):
     command = ["simulate", "pendulum", "--t1", "2", "--preset", "draft", "--out", str(tmp_path), "--no-plots"]
     assert main(command) == 0
     printed = capsys.readouterr().out
-    for word in ("successful", "steps", "compile time", "run time", "position violation", "energy error", "bob"):
+    for word in ("successful", "steps", "compile time", "run time", "position violation", "energy change", "bob"):
         assert word in printed
     assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "trajectory.npz"}
 

@@ -73,7 +73,7 @@ def _for_people(found, files):
         f"  position violation    {found['position_violation']:.1e} of the loop's length",
         f"  velocity violation    {found['velocity_violation']:.1e} of the largest speed",
         f"  acceleration violation {found['acceleration_violation']:.1e} of the largest acceleration",
-        f"  energy error          {found['energy_error']:.1e} of the largest kinetic energy",
+        f"  energy change         {found['energy_error']:.1e} of the largest kinetic energy",
         f"  independent loop rows {found['rank_min']} to {found['rank_max']}",
         *_of_singular_configurations(found),
         *final,

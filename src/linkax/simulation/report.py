@@ -11,9 +11,10 @@ def summary(run: TimedRun, points) -> dict:
     """Steps, times, violations, energy error, rank, passages, result and final positions of a run.
 
     Violations are relative (`Solution.worst_violation`); `energy_error` is the largest change of
-    the energy over the largest kinetic energy, or in joules where nothing moves. Of singular
-    configurations: the smallest distance at a saved time, the times of passages [s], and the
-    digits that they cost (`Solution.passages`). What is not finite, or not measured, is None.
+    the energy over the largest kinetic energy, or in joules where nothing moves: an error only
+    where no drive, damping or force of time adds or takes any. Of singular configurations: the
+    smallest distance at a saved time, the times of passages [s], and the digits that they cost
+    (`Solution.passages`). What is not finite, or not measured, is None.
     """
     solution = run.solution
     reached = np.isfinite(np.asarray(solution.ts))
