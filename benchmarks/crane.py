@@ -178,15 +178,15 @@ def cost(out):
 def presets(out):
     """A fifth of the load drops; seconds to run once compiled, and how far the tip is from that of the last row [m]."""
     _, mechanism, state = crane()
+    run = lambda accuracy: jax.block_until_ready(
+        lx.simulate(mechanism, state, t1=DROP, accuracy=accuracy, saveat=SAVED, max_steps=100_000)
+    )
+    run(lx.DRAFT)  # compiles the program of all three
     found = {}
     for name in ("DRAFT", "BALANCED", "PRECISE"):
         accuracy = getattr(lx, name)
-        run = lambda accuracy=accuracy: jax.block_until_ready(
-            lx.simulate(mechanism, state, t1=DROP, accuracy=accuracy, saveat=SAVED, max_steps=100_000)
-        )
-        run()
         began = time.perf_counter()
-        solution = run()
+        solution = run(accuracy)
         found[name] = accuracy, solution, time.perf_counter() - began
     tip = lambda solution: solution.position("section_3", at="tip")
     closest = tip(found["PRECISE"][1])

@@ -1,7 +1,8 @@
 """Products with matrices of which most entries are known to be zero when a program is compiled.
 
 What connects the bodies of a large mechanism concerns few of them at a time. Each product is computed by reading the
-entries that it needs, where these are few, and as a product of full matrices where they are not.
+entries that it needs, where these are few, and as a product of full matrices where they are not. What is read XLA
+computes anew for each entry that reads it, so that one such product must not follow another.
 """
 
 from typing import NamedTuple
