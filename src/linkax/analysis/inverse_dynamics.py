@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from linkax.simulation.accuracy import BALANCED
 from linkax.simulation.diagnosis import massless_bodies
 from linkax.simulation.given import by_joint, checked_state, checked_time
 from linkax.simulation.state import State
+from linkax.tracing import runs_once
 
 MET = 1e-9  # relative to the largest acceleration
 
@@ -71,7 +71,7 @@ def inverse_dynamics(mechanism: Mechanism, state: State, accelerations, *, t=0.0
     return InverseDynamics(dict(zip(accelerations, forces, strict=True)), acceleration)
 
 
-@eqx.filter_jit
+@runs_once
 def _inverse_dynamics(mechanism, state, wanted, t):
     system, (q, v) = system_of(mechanism, state.q.dtype), (state.q, state.v)
     configuration = configure(system, t, q)

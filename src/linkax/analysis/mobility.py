@@ -13,6 +13,7 @@ from linkax.model.topology import Topology
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.given import check_accuracy, checked_state, checked_time
 from linkax.simulation.state import State
+from linkax.tracing import runs_once
 
 INVOLVED = 1e-6  # least part of a row in a self-stress of magnitude one
 # Table 1 of the paper: which axes of parent and child each rotation row keeps orthogonal.
@@ -78,7 +79,7 @@ def mobility(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = 
     return _mobility(mechanism, checked_state(mechanism, state), jnp.asarray(checked_time(t, "t")), accuracy)
 
 
-@eqx.filter_jit
+@runs_once
 def _mobility(mechanism, state, t, accuracy):
     system, topology = system_of(mechanism, state.q.dtype, fixed_units=False), mechanism.topology
     tolerance = accuracy.method(system.dtype).rank_tolerance

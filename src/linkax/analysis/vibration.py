@@ -26,7 +26,7 @@ from linkax.simulation.assembly import CLOSED, LONGEST_STEP
 from linkax.simulation.diagnosis import massless_bodies
 from linkax.simulation.given import checked_state, checked_time
 from linkax.simulation.state import State
-from linkax.tracing import all_known
+from linkax.tracing import all_known, runs_once
 
 MOST_STEPS = 200
 AT_REST = 1e-12  # step [rad, lengths of the mechanism] below which the search for an equilibrium ends
@@ -154,7 +154,7 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
     return found
 
 
-@eqx.filter_jit
+@runs_once
 def _equilibrium(mechanism, state, t):
     system = _held_system(mechanism, state.q.dtype, t)
     q, longest = _at_rest(system, t, lax.stop_gradient(state.q))
@@ -278,13 +278,13 @@ def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: 
     return found
 
 
-@eqx.filter_jit
+@runs_once
 def _rank(mechanism, state, t):
     system = _held_system(mechanism, state.q.dtype, t)
     return jnp.sum(BALANCED.method(system.dtype).crossing(system, t, state.q).inverse.rank)
 
 
-@eqx.filter_jit
+@runs_once
 def _linearise(mechanism, state, t, count):
     system = _held_system(mechanism, state.q.dtype, t)
     method = BALANCED.method(system.dtype)

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from matplotlib.artist import Artist
@@ -21,6 +20,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.ropes import ElasticRope, Rope
 from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
 from linkax.simulation.solution import Solution
+from linkax.tracing import runs_once
 
 BODY_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 NEGLIGIBLE = 1e-9  # length of a direction seen from its end
@@ -151,7 +151,7 @@ def _scenery(moments, points) -> _Scenery:
     return _Scenery(mechanism, poses, outlines, traced, plane)
 
 
-@eqx.filter_jit
+@runs_once
 def _poses(solution):
     names = solution.mechanism.topology.bodies
     return {name: (solution.position(name, at=np.zeros(3)), solution.orientation(name)) for name in names}

@@ -13,7 +13,7 @@ from linkax.equations.loops import immobile_residual, jacobian, rate, residual, 
 from linkax.equations.motion import move
 from linkax.equations.reactions import Reaction, reactions, reactions_to, seen_from
 from linkax.equations.system import System
-from linkax.formulations.formulation import AbstractFormulation
+from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
 from linkax.spatial.rotations import rotate
@@ -46,7 +46,10 @@ class Power(NamedTuple):
 
 
 class Instant(NamedTuple):
-    """One saved time of a solution: found by `method`, split into normal and tangent space by `tangent_space`."""
+    """One saved time of a solution: found by `method`, split into normal and tangent space by `tangent_space`.
+
+    - `dynamics`: what `solve` finds, for the functions that need accelerations or multipliers.
+    """
 
     system: System
     method: AbstractFormulation
@@ -54,6 +57,7 @@ class Instant(NamedTuple):
     t: Float[Array, ""]
     q: Float[Array, " n_q"]
     v: Float[Array, " n_v"]
+    dynamics: Dynamics | None = None
 
     @property
     def configuration(self):
@@ -63,8 +67,7 @@ class Instant(NamedTuple):
     def motion(self):
         return move(self.configuration, self.v)
 
-    @property
-    def dynamics(self):
+    def solve(self) -> Dynamics:
         return self.method.dynamics(self.system, self.t, self.q, self.v)
 
     def position(self, body, point):
@@ -167,20 +170,14 @@ class Instant(NamedTuple):
         _, rise = jax.jvp(energy, (self.q,), (rates(self.system.topology, self.q, self.v),))
         return Power(force @ self.v + rise, self.dynamics.multipliers @ rate(self.system, self.t))
 
-    def violation(self):
-        return self._violated(self.dynamics)
-
-    def _violated(self, dynamics):
-        configuration = self.configuration
-        position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
-        velocity = jacobian(configuration) @ self.v - rate(self.system, self.t)
-        return Violation(*map(_size, (position, velocity, dynamics.violation)))
-
     def violation_and_scales(self):
         """The violation, and the largest speed and acceleration of the joints [1/s, 1/s²]."""
-        dynamics, units = self.dynamics, self.system.units
+        configuration, units = self.configuration, self.system.units
+        position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
+        velocity = jacobian(configuration) @ self.v - rate(self.system, self.t)
+        violation = Violation(*map(_size, (position, velocity, self.dynamics.violation)))
         speed = _size(self.v / units)
-        return self._violated(dynamics), speed, jnp.maximum(_size(dynamics.acceleration / units), speed**2)
+        return violation, speed, jnp.maximum(_size(self.dynamics.acceleration / units), speed**2)
 
     def rank(self):
         return jnp.sum(self.tangent_space.crossing(self.system, self.t, self.q).inverse.rank)

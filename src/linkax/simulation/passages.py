@@ -3,7 +3,6 @@
 import math
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from diffrax import ThirdOrderHermitePolynomialInterpolation
 from linkax.equations.coordinates import on_manifold, rates
 from linkax.equations.system import system_of
 from linkax.formulations.classical import ClassicalFormulation
+from linkax.tracing import runs_once
 
 REFINEMENTS = 4
 VANISHED = 0.1  # of the distances before and after: what a passage falls below
@@ -101,7 +101,7 @@ def _between(solution, intervals, places):
     return jax.tree.map(np.asarray, found)
 
 
-@eqx.filter_jit
+@runs_once
 def _between_states(solution, intervals, places):
     dtype = solution.q.dtype
     system, method = system_of(solution.mechanism, dtype), solution.accuracy.method(dtype, solution.rank_nearby)

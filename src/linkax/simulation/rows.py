@@ -34,7 +34,7 @@ def over_rows(function, saved, *arrays):
     shapes = jax.eval_shape(of_part, *(part[0] for part in given))
     blank = jax.tree.map(lambda shape: jnp.broadcast_to(_nothing(shape), shape.shape), shapes)
     found = lax.map(lambda part: lax.cond(jnp.any(part[0]), lambda: of_part(*part), lambda: blank), given)
-    return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:count], found)
+    return jax.tree.map(lambda array: array.reshape(parts * ROWS, *array.shape[2:])[:count], found)
 
 
 def _nothing(array):

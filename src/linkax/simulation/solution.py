@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.equations.system import system_of
-from linkax.formulations.formulation import AbstractFormulation
+from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known, number, require
@@ -24,6 +24,9 @@ from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
 from linkax.simulation.rows import over_rows
 from linkax.simulation.state import State
+from linkax.tracing import runs_once
+
+FEW = 100_000  # times of all members: reading more, or beams, takes longer than compiling
 
 
 class Solution(eqx.Module):
@@ -157,7 +160,7 @@ class Solution(eqx.Module):
 
     def reactions(self) -> dict[str, Reaction]:
         """The reactions of all joints on their children, in ground axes, by name."""
-        force, moment = _over_times(Instant.reactions, self, "child", "ground")
+        force, moment = _in_motion(Instant.reactions, self, "child", "ground")
         names = enumerate(self.mechanism.topology.joints)
         return {name: Reaction(force[..., index, :], moment[..., index, :]) for index, name in names}
 
@@ -175,11 +178,11 @@ class Solution(eqx.Module):
 
     def power(self) -> Power:
         """The rate of `energy`, by what causes it [W], each (n_t,)."""
-        return _over_times(Instant.power, self)
+        return _in_motion(Instant.power, self)
 
     def violation(self) -> Violation:
         """Largest violation of the loop rows at each time."""
-        return _over_times(Instant.violation, self)
+        return _in_motion(Instant.violation_and_scales, self)[0]
 
     def worst_violation(self) -> Violation:
         """Over all times, relative: to the run's largest speed and acceleration where those apply.
@@ -188,7 +191,7 @@ class Solution(eqx.Module):
         joints in radians and lengths of the mechanism; the square of a speed counts as an
         acceleration, since uniform motion of the joints accelerates the bodies.
         """
-        violation, speed, acceleration = _over_times(Instant.violation_and_scales, self)
+        violation, speed, acceleration = _in_motion(Instant.violation_and_scales, self)
         largest = lambda values: jnp.max(jnp.where(jnp.isfinite(self.ts), values, 0.0), axis=-1)
         relative = lambda values, scale: values / jnp.where(scale > 0.0, scale, 1.0)
         return Violation(
@@ -248,7 +251,7 @@ class Solution(eqx.Module):
 
     def _of_constraint(self, function, name):
         """Of all constraints, so that all names share a program, that of one."""
-        return _over_times(function, self)[..., self.mechanism.topology.constraints.index(name)]
+        return _in_motion(function, self)[..., self.mechanism.topology.constraints.index(name)]
 
     def _of_joint(self, function, name, on, axes):
         """Of reactions of all joints, so that all names share a program, those of one."""
@@ -257,7 +260,7 @@ class Solution(eqx.Module):
                 raise ValueError(f"{what} is {entry!r}; known: {', '.join(map(repr, choices))}")
         self.mechanism.joint(name)
         index = self.mechanism.topology.joints.index(name)
-        force, moment = _over_times(function, self, on, axes)
+        force, moment = _in_motion(function, self, on, axes)
         return Reaction(force[..., index, :], moment[..., index, :])
 
     def _body(self, name):
@@ -273,23 +276,22 @@ class Solution(eqx.Module):
     def _of_point(self, function, body, at):
         """A function of an `Instant` for a point of a rigid body or of a beam."""
         found = self.mechanism.body(body)
+        read = _in_motion if function is Instant.acceleration else _over_times
         if isinstance(found, Beam) and at is None:
-            return _over_times(
-                Instant.center_of_mass, self, function, np.stack([*map(self._index, found.sections)], axis=-1)
-            )
+            return read(Instant.center_of_mass, self, function, np.stack([*map(self._index, found.sections)], axis=-1))
         if at is None:
-            return _over_times(function, self, self._index(body), found.center_of_mass)
+            return read(function, self, self._index(body), found.center_of_mass)
         if isinstance(at, str):
             frame = found.at(at)
             offset = jnp.broadcast_to(frame.offset, (*self.ts.shape[:-1], 3))
-            return _over_times(function, self, self._index(frame.body), offset)
+            return read(function, self, self._index(frame.body), offset)
         what = f"point on body {body!r} [m]"
         if isinstance(found, Beam) and np.ndim(at) == 0:
             at = number(at, (), what) * np.eye(3)[0]
         offset = jnp.broadcast_to(number(at, (3,), what), (*self.ts.shape[:-1], 3))
         if isinstance(found, Beam):
-            return _over_times(Instant.on_beam, self, function, found, offset)
-        return _over_times(function, self, self._index(body), offset)
+            return read(Instant.on_beam, self, function, found, offset)
+        return read(function, self, self._index(body), offset)
 
     def _joint(self, function, name):
         self.mechanism.joint(name)
@@ -315,26 +317,39 @@ def _difference(solution, reading, factor):
     return of_member(solution)
 
 
-def _over_times(function, solution, *details):
+def _in_motion(function, solution, *details):
+    """`_over_times` of a function that needs accelerations or multipliers, for which all such share a program."""
+    return _over_times(function, solution, *details, dynamics=_over_times(Instant.solve, solution))
+
+
+def _over_times(function, solution, *details, dynamics=()):
     """Evaluate a function of an instant at all times of all members of a batch."""
     if solution.q is None:
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
+    few = solution.ts.size <= FEW and not solution.mechanism.beams
+    read = _of_few_times if few else _of_many_times
     # With another solver it would compile anew.
-    return _of_all_times(function, dataclasses.replace(solution, repeat=None), *details)
+    return read(function, dataclasses.replace(solution, repeat=None), dynamics, details)
 
 
-@eqx.filter_jit
-def _of_all_times(function, solution, *details):
-    def of_member(solution, *details):
+def _of_times(function, solution, dynamics, details):
+    def of_member(solution, dynamics, details):
         system = system_of(solution.mechanism, solution.q.dtype, fixed_units=False)
         tangent_space = solution.accuracy.method(solution.q.dtype, solution.rank_nearby)
         method = tangent_space if solution.formulation is None else solution.formulation
-        of_time = lambda t, q, v: function(Instant(system, method, tangent_space, t, q, v), *details)
-        return over_rows(of_time, jnp.isfinite(solution.ts), solution.ts, solution.q, solution.v)
+
+        def of_time(t, q, v, *dynamics):
+            found = Dynamics(*dynamics) if dynamics else None
+            return function(Instant(system, method, tangent_space, t, q, v, found), *details)
+
+        return over_rows(of_time, jnp.isfinite(solution.ts), solution.ts, solution.q, solution.v, *dynamics)
 
     for _ in range(solution.ts.ndim - 1):
         of_member = eqx.filter_vmap(of_member)
-    return of_member(solution, *details)
+    return of_member(solution, dynamics, details)
+
+
+_of_few_times, _of_many_times = runs_once(_of_times), eqx.filter_jit(_of_times)
 
 
 @eqx.filter_jit
