@@ -12,9 +12,9 @@ from linkax.compiler import makes_kernels_of_loops
 from linkax.tracing import in_one_kernel
 
 
-def motion():
+def motion(optimise=True):
     """Speeds of a crank-slider after a while, and the steps to there."""
-    found = lx.simulate(*start("crank-slider", "SC4"), t1=0.5)
+    found = lx.simulate(*start("crank-slider", "SC4"), t1=0.5, optimise=optimise)
     return {"speeds": np.asarray(found.v[-1]).tolist(), "steps": int(found.stats["num_steps"])}
 
 
@@ -31,4 +31,5 @@ def kernels():
 
 
 if __name__ == "__main__":
-    print(json.dumps({"makes_kernels": makes_kernels_of_loops(), "motion": motion(), "kernels": kernels()}))
+    motions = {"motion": motion(), "motion_once": motion(optimise=False)}
+    print(json.dumps({"makes_kernels": makes_kernels_of_loops(), **motions, "kernels": kernels()}))

@@ -29,8 +29,9 @@ def test_importing_linkax_is_enough_for_kernels(as_users_do):
     assert not makes_kernels_of_loops()
 
 
-def test_kernels_change_nothing_but_rounding(as_users_do):
-    one, other = as_users_do["motion"], motion()
+@pytest.mark.parametrize("compiled", ["motion", "motion_once"])
+def test_how_a_run_is_compiled_changes_nothing_but_rounding(as_users_do, compiled):
+    one, other = as_users_do[compiled], motion()
     assert one["steps"] == other["steps"]
     np.testing.assert_allclose(one["speeds"], other["speeds"], rtol=1e-10)
 

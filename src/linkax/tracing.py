@@ -24,22 +24,27 @@ def all_known(tree) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def runs_once(function):
-    """A function for a program that is seldom run more than once on the same kind of arguments.
+def compiled(function):
+    """A function as a program of its own, to be called with `once=True` where that is seldom run more than once.
 
-    Of known numbers it is compiled in half of the time, also inside of a transformation, which has no part in it.
+    Of known numbers it is compiled in half of the time then, also inside of a transformation, which has no part in it.
     """
-    transformed, quick = traced_once(function), eqx.filter_jit(function, compiler_options=quickest_to_compile())
+    often, quick = traced_once(function), eqx.filter_jit(function, compiler_options=quickest_to_compile())
 
     @wraps(function)
-    def either(*args):
-        if not all_known(args):
-            return transformed(*args)
+    def program(*args, once: bool):
+        if not once or not all_known(args):
+            return often(*args)
         # Not `jax.ensure_compile_time_eval`: with it JAX compiles each operation on constants by itself.
         with jax.core.eval_context():
             return quick(*args)
 
-    return either
+    return program
+
+
+def runs_once(function):
+    """A function for a program that is seldom run more than once on the same kind of arguments, see `compiled`."""
+    return wraps(function)(partial(compiled(function), once=True))
 
 
 def in_one_kernel(function, sound, *args):

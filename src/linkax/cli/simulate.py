@@ -69,7 +69,7 @@ def _for_people(found, files):
         f"  result                {found['result']}",
         f"  steps                 {found['steps']} ({found['rejected_steps']} of them rejected)",
         f"  compile time          {found['compile_s']:.2f} s",
-        f"  run time              {1e3 * found['run_s']:.1f} ms",
+        f"  run time              {1e3 * found['run_s']:.1f} ms{'' if found['optimised'] else ', not optimised'}",
         f"  position violation    {found['position_violation']:.1e} of the loop's length",
         f"  velocity violation    {found['velocity_violation']:.1e} of the largest speed",
         f"  acceleration violation {found['acceleration_violation']:.1e} of the largest acceleration",

@@ -24,12 +24,12 @@ class Repeat(eqx.Module):
 
     @staticmethod
     def of(simulate, *given) -> "Repeat":
-        """From `linkax.simulate`, and as it takes them: state, t0, dt0, solver, step size controller, max_steps."""
+        """From `linkax.simulate`, and as it takes them: state, t0, dt0, solver, controller, max_steps, optimise."""
         return Repeat(simulate, *eqx.partition(given, lambda leaf: isinstance(leaf, jax.Array | np.ndarray)))
 
     def __call__(self, solution, factor):
         """A run at `factor` times its tolerances, or at half its steps, saved at the same times."""
-        state, t0, dt0, solver, controller, max_steps = eqx.combine(self.arrays, self.rest)
+        state, t0, dt0, solver, controller, max_steps, optimise = eqx.combine(self.arrays, self.rest)
         accuracy = solution.accuracy
         if isinstance(MechanismControl(controller).innermost, diffrax.ConstantStepSize) and dt0 is not None:
             dt0 = 0.5 * dt0
@@ -48,6 +48,7 @@ class Repeat(eqx.Module):
             stepsize_controller=controller,
             dt0=dt0,
             max_steps=REFINED_STEPS * max_steps,
+            optimise=optimise,
             throw=False,
         )
 

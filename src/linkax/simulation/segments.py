@@ -21,15 +21,20 @@ from linkax.simulation.state import State
 SEGMENTS = 20
 DEFAULT_INTERVALS = 1000
 LONG_RUN = 2.0  # seconds
+WORTH_OPTIMISING = 4.0  # times the time to compile: a run that would take longer
 INSTANT = 1e-6  # of the whole time
 
 
 class TimedRun(NamedTuple):
-    """A solution, and the wall time that compiling and running took [s]."""
+    """A solution, the wall time that compiling and running took [s], and whether its program was optimised.
+
+    See `linkax.simulate`: with beams it always is.
+    """
 
     solution: Solution
     compile_s: float
     run_s: float
+    optimised: bool
 
 
 def simulate_in_segments(
@@ -47,7 +52,8 @@ def simulate_in_segments(
     """Integrate from 0 to t1 [s], and tell how far it is.
 
     A run that takes long is cut into segments, each with a few steps more than an uncut run
-    needs; the first one tells whether it is worth it. All share one compiled program.
+    needs. The first one tells whether that is worth it, and whether it is to optimise the program,
+    which all others share.
 
     **Arguments:**
 
@@ -59,7 +65,7 @@ def simulate_in_segments(
     **Returns:** a `TimedRun`; its solution ends with the segment that failed, if one did.
     """
 
-    def run(start, t0, end):
+    def run(start, t0, end, optimise):
         began = time.perf_counter()
         times = np.linspace(t0, end, intervals + 1)
         found = simulate(
@@ -71,30 +77,34 @@ def simulate_in_segments(
             solver=solver,
             formulation=formulation,
             saveat=diffrax.SaveAt(ts=times),
+            optimise=optimise,
             throw=False,
             **fixed_steps(step, t1),
         )
         return jax.block_until_ready(found), time.perf_counter() - began
 
     report("compiling", None)
-    _, compile_s = run(state, 0.0, INSTANT * t1)
+    optimised = bool(mechanism.beams)
+    _, compile_s = run(state, 0.0, INSTANT * t1, optimised)
     report("integrating", 0.0)
+    first, run_s = run(state, 0.0, t1 / SEGMENTS, optimised)
+    if not optimised and SEGMENTS * run_s > WORTH_OPTIMISING * compile_s:
+        report("optimising", None)
+        optimised, (_, seconds) = True, run(state, 0.0, INSTANT * t1, True)
+        compile_s += seconds
+        report("integrating", 1.0 / SEGMENTS)
     # A classical formulation keeps what it leaves open: a segment would begin on the loops again.
-    uncut = formulation is not None
-    if not uncut:
-        first, run_s = run(state, 0.0, t1 / SEGMENTS)
-        uncut = not _is_long(first, run_s)
-    if uncut:
-        whole, run_s = run(state, 0.0, t1)
-        return TimedRun(whole, compile_s, run_s)
+    if formulation is not None or not _is_long(first, run_s):
+        whole, run_s = run(state, 0.0, t1, optimised)
+        return TimedRun(whole, compile_s, run_s, optimised)
     parts, borders = [first], np.linspace(0.0, t1, SEGMENTS + 1)
     for t0, end in itertools.pairwise(borders[1:]):
         if parts[-1].result != RESULTS.successful:
             break
         report("integrating", float(t0 / t1))
-        part, seconds = run(parts[-1].end, t0, end)
+        part, seconds = run(parts[-1].end, t0, end, optimised)
         parts, run_s = [*parts, part], run_s + seconds
-    return TimedRun(_joined(parts), compile_s, run_s)
+    return TimedRun(_joined(parts), compile_s, run_s, optimised)
 
 
 def _is_long(first, seconds):

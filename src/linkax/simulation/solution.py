@@ -24,7 +24,7 @@ from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
 from linkax.simulation.rows import over_rows
 from linkax.simulation.state import State
-from linkax.tracing import runs_once
+from linkax.tracing import compiled
 
 FEW = 100_000  # times of all members: reading more, or beams, takes longer than compiling
 
@@ -327,11 +327,11 @@ def _over_times(function, solution, *details, dynamics=()):
     if solution.q is None:
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
     few = solution.ts.size <= FEW and not solution.mechanism.beams
-    read = _of_few_times if few else _of_many_times
     # With another solver it would compile anew.
-    return read(function, dataclasses.replace(solution, repeat=None), dynamics, details)
+    return _of_times(function, dataclasses.replace(solution, repeat=None), dynamics, details, once=few)
 
 
+@compiled
 def _of_times(function, solution, dynamics, details):
     def of_member(solution, dynamics, details):
         system = system_of(solution.mechanism, solution.q.dtype, fixed_units=False)
@@ -347,9 +347,6 @@ def _of_times(function, solution, dynamics, details):
     for _ in range(solution.ts.ndim - 1):
         of_member = eqx.filter_vmap(of_member)
     return of_member(solution, dynamics, details)
-
-
-_of_few_times, _of_many_times = runs_once(_of_times), eqx.filter_jit(_of_times)
 
 
 @eqx.filter_jit
