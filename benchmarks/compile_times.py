@@ -1,11 +1,11 @@
-"""Tracing, compiling and running simulations and their gradients, BALANCED unless named.
+"""What a first run waits for: tracing and compiling, BALANCED unless named.
 
-The crank-slider SC1 over 10 s; Bricard's mechanism over 1 s; and a row of four four-bars over 1 s with twenty
-parameters: masses and inertias of nine bodies, gravity, angle at the start. `--json` prints one JSON object.
+first-runs: `linkax.simulate` over 10 s, by how much the first of equal runs takes longer than the others, with and
+without `optimise`. programs: compiled as one each, simulations and their gradients: the crank-slider SC1 over 10 s;
+Bricard's mechanism over 1 s; and a row of four four-bars over 1 s with twenty parameters: masses and inertias of nine
+bodies, gravity, angle at the start.
 """
 
-import argparse
-import json
 import time
 
 import diffrax
@@ -14,10 +14,12 @@ import jax
 import jax.numpy as jnp
 
 import linkax as lx
+from benchmarks.parts import print_parts
 from linkax.scenes import SCENES
 
 SCENE = SCENES["crank-slider"]
 REPEATS = 7
+FIRST_RUNS = (("crank-slider", {}), ("bricard", {}), ("n-four-bar", {"N": 40}))
 
 
 def motion(numbers, accuracy):
@@ -58,44 +60,60 @@ def staged(function, *arguments):
     traced = time.perf_counter()
     compiled = lowered.compile()
     ready = time.perf_counter()
-
-    def once():
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(*arguments))
-        return time.perf_counter() - start
-
-    once()
-    return {"trace_s": traced - began, "compile_s": ready - traced, "run_ms": 1e3 * min(once() for _ in range(REPEATS))}
+    run_s = least(lambda: compiled(*arguments))
+    return {"trace_s": round(traced - began, 2), "compile_s": round(ready - traced, 2), "run_ms": milliseconds(run_s)}
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true")
-    arguments = parser.parse_args()
+def milliseconds(seconds):
+    return round(1e3 * seconds, 2)
+
+
+def seconds_of(run):
+    start = time.perf_counter()
+    jax.block_until_ready(run())
+    return time.perf_counter() - start
+
+
+def least(run):
+    return min(seconds_of(run) for _ in range(REPEATS))
+
+
+def first_runs():
+    for name, changes in FIRST_RUNS:
+        for optimise in (True, False):
+            jax.clear_caches()
+            scene = SCENES[name]
+            settings = scene.settings(None, changes)
+            mechanism = scene.mechanism(settings)
+            state = scene.initial(mechanism, settings)
+            run = lambda mechanism=mechanism, state=state, optimise=optimise: lx.simulate(
+                mechanism, state, t1=10.0, optimise=optimise
+            )
+            first, again = seconds_of(run), least(run)
+            asked = {"scene": name, **changes, "optimise": optimise}
+            yield asked | {"compile_s": round(first - again, 2), "run_ms": milliseconds(again)}
+
+
+def programs():
     numbers = {name: jnp.asarray(1.0) for name in ("crank_mass", "rod_mass", "slider_mass")}
     bricard = {name: jnp.asarray(1.0) for name in ("length", "mass")}
     settings = SCENES["n-four-bar"].settings(None, {"N": 4})
     twenty = jnp.asarray([settings["gravity"], settings["angle"], *[1.0] * 18])
-    jax.block_until_ready(jnp.zeros(3) + 1.0)  # starts the backend
-    found = {
-        "simulate, BALANCED": staged(lambda numbers: motion(numbers, lx.BALANCED), numbers),
-        "simulate, PRECISE": staged(lambda numbers: motion(numbers, lx.PRECISE), numbers),
-        "gradient": staged(jax.grad(lambda numbers: motion(numbers, lx.BALANCED)[-1, 1]), numbers),
-        "Bricard": staged(of_bricard, bricard),
-        "Bricard, gradient": staged(jax.grad(of_bricard), bricard),
-        "20 parameters": staged(of_twenty, twenty),
-        "20 parameters, gradient": staged(jax.grad(of_twenty), twenty),
-    }
-    ratio = found["20 parameters, gradient"]["run_ms"] / found["20 parameters"]["run_ms"]
-    if arguments.json:
-        print(json.dumps(found | {"gradient over run, 20 parameters": ratio}))
-        return
-    for name, row in found.items():
-        print(
-            f"{name:23} trace {row['trace_s']:6.2f} s  compile {row['compile_s']:6.2f} s  run {row['run_ms']:8.1f} ms"
-        )
-    print(f"gradient over run, 20 parameters: {ratio:.1f}")
+    last = {}
+    for name, function, given in (
+        ("simulate, BALANCED", lambda numbers: motion(numbers, lx.BALANCED), numbers),
+        ("simulate, PRECISE", lambda numbers: motion(numbers, lx.PRECISE), numbers),
+        ("gradient", jax.grad(lambda numbers: motion(numbers, lx.BALANCED)[-1, 1]), numbers),
+        ("Bricard", of_bricard, bricard),
+        ("Bricard, gradient", jax.grad(of_bricard), bricard),
+        ("20 parameters", of_twenty, twenty),
+        ("20 parameters, gradient", jax.grad(of_twenty), twenty),
+    ):
+        last[name] = staged(function, given)
+        yield {"program": name, **last[name]}
+    ratio = last["20 parameters, gradient"]["run_ms"] / last["20 parameters"]["run_ms"]
+    yield {"program": "20 parameters, gradient over run", "ratio": round(ratio, 1)}
 
 
 if __name__ == "__main__":
-    main()
+    print_parts(__doc__, {"first-runs": first_runs, "programs": programs})
