@@ -9,6 +9,7 @@ import pytest
 
 import linkax as lx
 from linkax.scenes import SCENES
+from linkax.simulation import segments
 
 
 def pendulum(length=1.0, forces=()):
@@ -42,6 +43,33 @@ def test_other_numbers_compile_nothing_anew():
     assert traces > 0
     run(1.3, 0.2, 0.4, 2.0, 1e-7)
     assert CountingTorque.traces == traces
+
+
+def test_poses_are_those_of_each_body():
+    scene = SCENES["spatial-four-link"]
+    settings = scene.settings(None, {})
+    mechanism = scene.mechanism(settings)
+    found = lx.Solution.of_state(mechanism, scene.initial(mechanism, settings))
+    assert list(found.poses()) == [body.name for body in mechanism.bodies]
+    for name, pose in found.poses().items():
+        np.testing.assert_allclose(pose.origin, found.position(name, at=[0.0, 0.0, 0.0]), atol=1e-15)
+        np.testing.assert_allclose(pose.axes, found.orientation(name), atol=1e-15)
+
+
+@pytest.mark.parametrize(("worth", "optimised"), [(np.inf, False), (0.0, True)])
+def test_a_run_in_segments_is_the_run(monkeypatch, worth, optimised):
+    monkeypatch.setattr(segments, "LONG_RUN", 0.0)
+    monkeypatch.setattr(segments, "WORTH_OPTIMISING", worth)
+    told, mechanism = [], pendulum()
+    state = lx.assemble(mechanism, {"pivot": 0.3})
+    options = {"t1": 2.0, "accuracy": lx.PRECISE}
+    found = segments.simulate_in_segments(mechanism, state, **options, report=lambda *now: told.append(now))
+    assert found.optimised == optimised
+    assert (("optimising", None) in told) == optimised
+    assert told[-1] == ("integrating", pytest.approx(0.95))
+    whole = lx.simulate(mechanism, state, saveat=diffrax.SaveAt(ts=found.solution.ts), **options)
+    np.testing.assert_allclose(found.solution.ts, np.linspace(0.0, 2.0, 1001), rtol=1e-15)
+    np.testing.assert_allclose(found.solution.q, whole.q, atol=1e-10)
 
 
 def test_a_batch_equals_single_runs():

@@ -19,8 +19,8 @@ from linkax.model.joints.bending import OnBeam
 from linkax.model.mechanism import Mechanism
 from linkax.model.ropes import ElasticRope, Rope
 from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
+from linkax.simulation.instant import Pose
 from linkax.simulation.solution import Solution
-from linkax.tracing import runs_once
 
 BODY_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 NEGLIGIBLE = 1e-9  # length of a direction seen from its end
@@ -111,14 +111,14 @@ def _moments(solution) -> Solution:
 class _Scenery(NamedTuple):
     """What is drawn, over all frames (n_f).
 
-    - `poses`: origin (n_f, 3) and axes (n_f, 3, 3) of each body, ground included.
+    - `poses`: of each body in each frame, ground included.
     - `outlines`: points of each body in its own frame, (n, 3).
     - `points`: positions of the points to trace, (n_f, 3).
     - `plane`: the two ground axes that span the picture.
     """
 
     mechanism: Mechanism
-    poses: dict[str, tuple[np.ndarray, np.ndarray]]
+    poses: dict[str, Pose]
     outlines: dict[str, np.ndarray]
     points: dict[str, np.ndarray]
     plane: tuple[int, int]
@@ -142,8 +142,8 @@ class _Scenery(NamedTuple):
 
 def _scenery(moments, points) -> _Scenery:
     mechanism, count = moments.mechanism, len(moments.ts)
-    poses = {name: tuple(map(np.asarray, pose)) for name, pose in _poses(moments).items()}
-    poses[GROUND_NAME] = np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
+    poses = {name: Pose(*map(np.asarray, pose)) for name, pose in moments.poses().items()}
+    poses[GROUND_NAME] = Pose(np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3)))
     outlines = {name: _outline(mechanism, name) for name in poses}
     traced = {name: np.asarray(moments.position(body, at)) for name, (body, at) in points.items()}
     spread = np.ptp(_everything(poses, outlines, traced), axis=0)
@@ -151,15 +151,8 @@ def _scenery(moments, points) -> _Scenery:
     return _Scenery(mechanism, poses, outlines, traced, plane)
 
 
-@runs_once
-def _poses(solution):
-    names = solution.mechanism.topology.bodies
-    return {name: (solution.position(name, at=np.zeros(3)), solution.orientation(name)) for name in names}
-
-
 def _placed(pose, offset):
-    origin, axes = pose
-    return origin + axes @ np.asarray(offset)
+    return pose.origin + pose.axes @ np.asarray(offset)
 
 
 def _everything(poses, outlines, points):

@@ -34,6 +34,13 @@ class Violation(NamedTuple):
     acceleration: Float[Array, "..."]
 
 
+class Pose(NamedTuple):
+    """Where a body's reference frame is: its origin [m], (..., 3), and its axes as columns, (..., 3, 3)."""
+
+    origin: Float[Array, "... 3"]
+    axes: Float[Array, "... 3 3"]
+
+
 class Power(NamedTuple):
     """What raises kinetic plus potential energy [W].
 
@@ -101,6 +108,10 @@ class Instant(NamedTuple):
             return moving(self.t, self.q, self.v)
         changes = jnp.ones_like(self.t), rates(self.system.topology, self.q, self.v), self.dynamics.acceleration
         return jax.jvp(moving, (self.t, self.q, self.v), changes)[1]
+
+    def poses(self):
+        configuration = self.configuration
+        return Pose(configuration.world_position(), configuration.rotation[: self.system.topology.num_bodies])
 
     def orientation(self, body):
         return self.configuration.rotation[body]

@@ -18,7 +18,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known, number, require
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.given import check_accuracy, checked_state, checked_time
-from linkax.simulation.instant import Instant, Power, Violation
+from linkax.simulation.instant import Instant, Pose, Power, Violation
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
@@ -111,6 +111,12 @@ class Solution(eqx.Module):
     def angular_velocity(self, body: str) -> Float[Array, "*batch n_t 3"]:
         """Angular velocity of a body [rad/s]."""
         return _over_times(Instant.angular_velocity, self, self._body(body))
+
+    def poses(self) -> dict[str, Pose]:
+        """Reference frames of all bodies by name, of a beam those of its sections: what an animation needs."""
+        origin, axes = _over_times(Instant.poses, self)
+        names = enumerate(self.mechanism.topology.bodies)
+        return {name: Pose(origin[..., index, :], axes[..., index, :, :]) for index, name in names}
 
     def joint(self, name: str) -> Float[Array, "..."]:
         """Coordinate of a joint, in the tree or cut [rad or m]; (n_t, n) where it has several."""
