@@ -83,6 +83,7 @@ from linkax.simulation.instant import Pose as Pose  # noqa: E402
 from linkax.simulation.instant import Power as Power  # noqa: E402
 from linkax.simulation.instant import Violation as Violation  # noqa: E402
 from linkax.simulation.results import RESULTS as RESULTS  # noqa: E402
+from linkax.simulation.results import AccuracyWarning as AccuracyWarning  # noqa: E402
 from linkax.simulation.results import SimulationError as SimulationError  # noqa: E402
 from linkax.simulation.runge_kutta import RungeKutta4 as RungeKutta4  # noqa: E402
 from linkax.simulation.simulate import simulate as simulate  # noqa: E402

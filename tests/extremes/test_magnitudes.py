@@ -8,7 +8,7 @@ from known_answers import crank_slider, turning
 
 import linkax as lx
 from linkax.scenes import SCENES
-from linkax.simulation.diagnosis import cause
+from linkax.simulation.diagnosis import cause, lost_accuracy
 from linkax.simulation.results import RESULTS
 
 PLAIN = {"crank": 1.0, "rod": 3.0, "crank_mass": 1.0, "rod_mass": 1.0, "slider_mass": 1.0}
@@ -104,6 +104,23 @@ def test_a_long_rod_that_a_short_crank_carries_is_named():
     q = np.array([start[name] for name in mechanism.topology.coordinates])
     with pytest.raises(lx.SimulationError, match=r"leaves 0 digits .* 'crank' next to that of 'rod'.*cut=True"):
         lx.simulate(mechanism, lx.State(q, 0.0 * q), t1=DURATION)
+
+
+def test_digits_lost_to_a_long_rod_are_told():
+    """In the tree's own choice, as above; `turning` cuts the joint that the warning names."""
+    settings = SCENES["crank-slider"].settings(changes=PLAIN | {"rod": 1e4})
+    mechanism = SCENES["crank-slider"].mechanism(settings)
+    state, accuracy = SCENES["crank-slider"].initial(mechanism, settings), lx.Accuracy(rtol=1e-9)
+    with pytest.warns(lx.AccuracyWarning, match=r"rtol is 1e-09.*'crank' next to.*'rod'.*cut=True .*'crank_pin'"):
+        found = lx.simulate(mechanism, state, t1=DURATION, accuracy=accuracy)
+    assert off(found, {"rod": 1e4}) > MANY_STEPS * accuracy.rtol
+    assert np.max(found.error_estimate(lambda it: it.joint("bearing"))) > MANY_STEPS * accuracy.rtol
+
+
+def test_digits_lost_to_many_bodies_are_told():
+    mechanism, _ = turning(PLAIN)
+    assert "very many" in lost_accuracy(mechanism, jnp.asarray(1e-10), 1e-12)
+    assert lost_accuracy(mechanism, jnp.asarray(1e-10), 1e-6) == ""
 
 
 def test_beams_lose_no_inertia_to_their_nodes():

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 
 import linkax as lx
 from linkax.cli import compare, simulate
@@ -18,8 +19,10 @@ class _Parser(argparse.ArgumentParser):
 def main(argv=None) -> int:
     """Run the command line; returns the exit code: 0, 1 for a run that failed, 2 for bad input."""
     try:
-        arguments = _parser().parse_args(argv)
-        return arguments.command(arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: print(f"linkax: {message}", file=sys.stderr)
+            arguments = _parser().parse_args(argv)
+            return arguments.command(arguments)
     except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
         sys.stderr.close()
         return 0

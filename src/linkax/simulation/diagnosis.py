@@ -20,6 +20,9 @@ from linkax.simulation.results import RESULTS
 AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
 OPEN_ULPS = 1e3  # that loops are open where constraints contradict each other
 LOST = 1e-9  # of an inertia: what is below leaves too few digits of double precision
+UNSEEN = 10.0  # tolerances: rounding of accelerations that adds little to the errors of steps
+UNSEEN_ULPS = 1e5
+TO_BLAME = 100.0  # times the definiteness of the mass matrix: share of an inertia that explains it
 NULL = 1e-10  # eigenvalue of a mass matrix of ones
 
 
@@ -150,7 +153,23 @@ def _widest(system, mechanism, t, q):
     return names[widest], float(sizes[widest])
 
 
-def _lost_inertia(system):
+def lost_accuracy(mechanism, definiteness, rtol) -> str:
+    """A sentence on accelerations that rounding keeps from the tolerance, or nothing.
+
+    **Arguments:** `definiteness`: of the mass matrix, see `linkax.linalg.constrained_solve.Inverse`.
+    """
+    eps = jnp.finfo(definiteness.dtype).eps
+    rounding = eps / float(definiteness)
+    if rounding <= max(UNSEEN * float(rtol), UNSEEN_ULPS * eps):
+        return ""
+    system = system_of(mechanism, definiteness.dtype)
+    why = _lost_inertia(system, below=TO_BLAME * float(definiteness))
+    many = " Some bodies carry others far larger, or very many; ask for a larger rtol."
+    off = f"Rounding alone puts accelerations off by {rounding:.0e} of their size, and rtol is {float(rtol):.0e}."
+    return off + (why or many)
+
+
+def _lost_inertia(system, below=LOST):
     """A body of which rounding leaves little in the inertia about its joint, next to what it carries far out."""
     topology, carrier = system.topology, np.array(system.topology.predecessor)
     offsets = np.stack([system.parent_offset, system.child_offset], axis=1)[: topology.num_bodies]
@@ -166,7 +185,7 @@ def _lost_inertia(system):
     # What is carried resists the carrier with its mass alone.
     left = (inertia[carrier] + system.mass * arms)[carried] / inertia[carried]
     carried, left = carried[left > 0.0], left[left > 0.0]  # what has no inertia loses none
-    if not len(carried) or not np.min(left) < LOST:
+    if not len(carried) or not np.min(left) < below:
         return ""
     body = carried[np.argmin(left)]
     names = topology.bodies[carrier[body]], topology.bodies[body], topology.joints[body]

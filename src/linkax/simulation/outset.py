@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from linkax.equations.configuration import configure
 from linkax.equations.loops import gaps
@@ -25,6 +25,7 @@ class Outset(NamedTuple):
 
     - `rank`: of J at the states next to it along the motion, for each island of the mechanism, or each cell of its
       chain where it has one.
+    - `definiteness`: of the mass matrix on the tangent space, see `linkax.linalg.constrained_solve.Inverse`.
     - `assembled`: not marked by `linkax.assemble`, by infinite speeds, as a state that it did not find.
     - `finite`, `closed`; `massive`: all that can move has mass; `on_branch`: the speeds lie on a
       branch of the motion; `unique`: so does, at rest, the acceleration.
@@ -32,6 +33,7 @@ class Outset(NamedTuple):
 
     state: State
     rank: Int[Array, " k"]
+    definiteness: Float[Array, ""]
     assembled: Bool[Array, ""]
     finite: Bool[Array, ""]
     massive: Bool[Array, ""]
@@ -65,7 +67,7 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, acceleration, 0.0)))
     if system.topology.num_rows == 0:
         true = jnp.ones((), bool)
-        return Outset(start, crossing.inverse.rank, assembled, finite, massive, true, true, true)
+        return Outset(start, crossing.inverse.rank, definiteness, assembled, finite, massive, true, true, true)
     gap = gaps(crossing.configuration)
     small = jnp.sqrt(eps)
     at_rest = crossing.fastest(v) ** 2 <= eps * crossing.fastest(acceleration)
@@ -76,6 +78,7 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     return Outset(
         state=start,
         rank=method.ranks_along(system, t, q, direction, rank),
+        definiteness=definiteness,
         assembled=assembled,
         finite=finite,
         massive=massive,

@@ -1,5 +1,6 @@
 """A run once more, more accurately, which tells how far off the first one is."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from linkax.simulation.integration import MechanismControl
+from linkax.simulation.results import AccuracyWarning
 
 FINEST = 1e-13  # tolerance
 REFINED_STEPS = 4  # as many as in the run before
@@ -36,21 +38,23 @@ class Repeat(eqx.Module):
         elif not MechanismControl(controller).is_adaptive:
             raise ValueError(f"steps of {type(controller).__name__} cannot be refined; use an adaptive controller")
         controller, accuracy = with_tolerances(lambda rtol: jnp.maximum(factor * rtol, FINEST), (controller, accuracy))
-        return self.simulate(
-            solution.mechanism,
-            state,
-            t0=t0,
-            t1=solution.t_end,
-            accuracy=accuracy,
-            formulation=solution.formulation,
-            saveat=diffrax.SaveAt(ts=jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)),
-            solver=solver,
-            stepsize_controller=controller,
-            dt0=dt0,
-            max_steps=REFINED_STEPS * max_steps,
-            optimise=optimise,
-            throw=False,
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AccuracyWarning)  # how far off a run is, this one is to tell
+            return self.simulate(
+                solution.mechanism,
+                state,
+                t0=t0,
+                t1=solution.t_end,
+                accuracy=accuracy,
+                formulation=solution.formulation,
+                saveat=diffrax.SaveAt(ts=jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)),
+                solver=solver,
+                stepsize_controller=controller,
+                dt0=dt0,
+                max_steps=REFINED_STEPS * max_steps,
+                optimise=optimise,
+                throw=False,
+            )
 
 
 def with_tolerances(change, tree):

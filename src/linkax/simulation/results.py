@@ -65,6 +65,10 @@ def result_name(result) -> str:
     return "failed"
 
 
+class AccuracyWarning(UserWarning):
+    """A simulation that rounding keeps from the tolerance asked for; `Solution.error_estimate` tells how far."""
+
+
 class SimulationError(RuntimeError):
     """A simulation that did not reach its end; `solution` holds the part computed."""
 

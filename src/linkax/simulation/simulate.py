@@ -1,5 +1,6 @@
 """Integration of a mechanism's motion in time."""
 
+import warnings
 from typing import Any, NamedTuple
 
 import diffrax
@@ -15,7 +16,7 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.diagnosis import cause
+from linkax.simulation.diagnosis import cause, lost_accuracy
 from linkax.simulation.given import check_accuracy, checked_state, checked_time
 from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.options import (
@@ -29,7 +30,7 @@ from linkax.simulation.options import (
 from linkax.simulation.outset import Outset, depart
 from linkax.simulation.repeat import Repeat
 from linkax.simulation.replay import Course, Steps, integrate, is_replayable
-from linkax.simulation.results import ENDED_WELL, RESULTS, SimulationError, result_name
+from linkax.simulation.results import ENDED_WELL, RESULTS, AccuracyWarning, SimulationError, result_name
 from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
@@ -92,7 +93,8 @@ def simulate(
 
     **Raises:** `ValueError` for bad arguments; `SimulationError`, which holds the `.solution` so
     far, where the run ends early: loops that do not close, numbers that are not finite,
-    `max_steps` reached, a step size that falls to nothing.
+    `max_steps` reached, a step size that falls to nothing. Warns (`AccuracyWarning`), outside JAX
+    transformations, where rounding keeps accelerations from the tolerance: a body carries one far longer.
     """
     dtype, t0, t1 = floating(dtype), checked_time(t0, "t0"), checked_time(t1, "t1")
     if known(t0) is not None and known(t1) is not None and not t1 > t0:
@@ -161,8 +163,12 @@ def simulate(
         interpolation=found.interpolation,
         repeat=Repeat.of(simulate, state, t0, dt0, solver, stepsize_controller, max_steps, optimise),
     )
-    if throw and all_known(solution):
-        _raise_if_failed(solution, state)
+    if all_known(solution):
+        if throw:
+            _raise_if_failed(solution, state)
+        rtol, _ = control.tolerances((accuracy.rtol, None))
+        if result_name(solution.result) in ENDED_WELL and (why := lost_accuracy(mechanism, outset.definiteness, rtol)):
+            warnings.warn(why, AccuracyWarning, stacklevel=2)
     return solution
 
 
