@@ -164,10 +164,11 @@ def simulate(
         repeat=Repeat.of(simulate, state, t0, dt0, solver, stepsize_controller, max_steps, optimise),
     )
     if all_known(solution):
-        if throw:
-            _raise_if_failed(solution, state)
         rtol, _ = control.tolerances((accuracy.rtol, None))
-        if result_name(solution.result) in ENDED_WELL and (why := lost_accuracy(mechanism, outset.definiteness, rtol)):
+        if result_name(solution.result) not in ENDED_WELL:
+            if throw:
+                raise _failure(solution, state)
+        elif why := lost_accuracy(mechanism, outset.definiteness, rtol):
             warnings.warn(why, AccuracyWarning, stacklevel=2)
     return solution
 
@@ -389,9 +390,8 @@ def _result(result, outset, in_order, is_adaptive):
     return RESULTS.where(in_order, result, RESULTS.times_out_of_order)
 
 
-def _raise_if_failed(solution, state):
-    if result_name(solution.result) in ENDED_WELL:
-        return
+def _failure(solution, state) -> SimulationError:
+    """Where and why a run failed."""
     at_start = (
         "times_out_of_order",
         "not_finite",
@@ -403,4 +403,4 @@ def _raise_if_failed(solution, state):
     )
     before = any(solution.result == getattr(RESULTS, name) for name in at_start)
     when = "before it began" if before else f"at t = {float(solution.t_end):.6g} s"
-    raise SimulationError(f"simulation stopped {when}: {RESULTS[solution.result]}{cause(solution, state)}", solution)
+    return SimulationError(f"simulation stopped {when}: {RESULTS[solution.result]}{cause(solution, state)}", solution)
