@@ -245,3 +245,14 @@ def test_a_traced_axis_drops_no_row():
 
     assert loop("z") == loop((0.0, 1.0, 1.0)) == 2
     assert loop(jnp.array([0.0, 0.0, 1.0])) == 5
+
+
+def test_a_mechanism_keeps_its_numbers():
+    inertia, offset = np.eye(3), np.array([0.0, 0.0, 0.5])
+    body = lx.RigidBody("link", mass=1.0, inertia=inertia, frames={"tip": offset})
+    inertia *= 3.0
+    offset *= 3.0
+    np.testing.assert_array_equal(body.inertia, np.eye(3))
+    np.testing.assert_array_equal(body.frames["tip"], [0.0, 0.0, 0.5])
+    with pytest.raises(ValueError, match="read-only"):
+        body.inertia[0, 0] = 2.0

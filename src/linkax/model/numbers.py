@@ -60,7 +60,9 @@ def _in_double(entry):
         return jnp.asarray(entry, dtype=float)
     if any(isinstance(part, jax.Array) for part in jax.tree.leaves(entry)):
         return jnp.stack([jnp.asarray(part, dtype=float) for part in entry])
-    return np.asarray(entry, dtype=np.float64)
+    array = np.array(entry, dtype=np.float64)  # not that of the caller, which may change
+    array.flags.writeable = False
+    return array
 
 
 def converted(entry, what: str, convert):
