@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool
 
 from linkax.equations.system import system_of
@@ -123,8 +124,9 @@ def simulate(
         adjoint = diffrax.ForwardMode() if replayed else diffrax.RecursiveCheckpointAdjoint()
     control = MechanismControl(traced_tolerances(stepsize_controller), is_final=replayed)
     once = not optimise and not mechanism.beams  # whose large arrays take as long to compile either way
+    mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
     # Compiled apart, so that another solver, formulation or saveat compiles no more than it must.
-    mechanism, accuracy, outset = _start(mechanism, state, t0, accuracy, dtype)
+    outset = _start(mechanism, state, t0, accuracy)
     found, formulation = _integrate(
         mechanism,
         accuracy,
@@ -163,7 +165,7 @@ def simulate(
         interpolation=found.interpolation,
         repeat=Repeat.of(simulate, state, t0, dt0, solver, stepsize_controller, max_steps, optimise),
     )
-    if all_known(solution):
+    if all_known((found, end, saved)):
         rtol, _ = control.tolerances((accuracy.rtol, None))
         if result_name(solution.result) not in ENDED_WELL:
             if throw:
@@ -212,15 +214,15 @@ def _wrapped_event(event):
 
 
 def _cast(tree, dtype):
-    floating = lambda leaf: eqx.is_inexact_array(leaf)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if floating(leaf) else leaf, tree)
+    """A pytree with its numbers in a floating-point type."""
+    real = lambda leaf: isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype) if real(leaf) and leaf.dtype != dtype else leaf, tree)
 
 
 @runs_once
-def _start(mechanism, state, t0, accuracy, dtype):
-    """Mechanism and accuracy in the floating-point type of the run, and the state on the loops."""
-    mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
-    return mechanism, accuracy, depart(accuracy.method(dtype), system_of(mechanism, dtype), t0, state)
+def _start(mechanism, state, t0, accuracy) -> Outset:
+    dtype = state.q.dtype
+    return depart(accuracy.method(dtype), system_of(mechanism, dtype), t0, state)
 
 
 def _problem(mechanism, accuracy, outset, formulation) -> Problem:
