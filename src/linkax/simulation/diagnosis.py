@@ -23,6 +23,9 @@ LOST = 1e-9  # of an inertia: what is below leaves too few digits of double prec
 UNSEEN = 10.0  # tolerances: rounding of accelerations that adds little to the errors of steps
 UNSEEN_ULPS = 1e5
 TO_BLAME = 100.0  # times the definiteness of the mass matrix: share of an inertia that explains it
+LINGERS = 3e-5  # mean distance from a singular configuration of a motion that does not leave it
+STAYS_ULPS = 8.0  # the same of what stands still in it
+PASSES = 3e-2  # distance from a singular configuration that branches are told apart from in single precision
 NULL = 1e-10  # eigenvalue of a mass matrix of ones
 
 
@@ -165,8 +168,28 @@ def lost_accuracy(mechanism, definiteness, rtol) -> str:
     system = system_of(mechanism, definiteness.dtype)
     why = _lost_inertia(system, below=TO_BLAME * float(definiteness))
     many = " Some bodies carry others far larger, or very many; ask for a larger rtol."
-    off = f"Rounding alone puts accelerations off by {rounding:.0e} of their size, and rtol is {float(rtol):.0e}."
+    off = f" Rounding alone puts accelerations off by {rounding:.0e} of their size, and rtol is {float(rtol):.0e}."
     return off + (why or many)
+
+
+def uncertain_branch(closest, average) -> str:
+    """A sentence on branches of motion that rounding may confuse, or nothing.
+
+    **Arguments:** the smallest and the mean distance from a singular configuration.
+    """
+    info = jnp.finfo(closest.dtype)
+    closest, average = float(closest), float(average)
+    if info.bits < 64 and closest < PASSES:
+        return (
+            f" The motion passes a singular configuration, where branches of motion cross, at a distance of "
+            f"{closest:.0e}: rounding of single precision may move it to another; compare with double precision."
+        )
+    if STAYS_ULPS * info.eps < average < LINGERS:
+        return (
+            f" The motion does not leave a singular configuration, where branches of motion cross, by more than about "
+            f"{average:.0e}: rounding may move it from one to another, which puts it off by more than that."
+        )
+    return ""
 
 
 def _lost_inertia(system, below=LOST):

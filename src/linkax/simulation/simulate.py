@@ -17,7 +17,7 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.diagnosis import cause, lost_accuracy
+from linkax.simulation.diagnosis import cause, lost_accuracy, uncertain_branch
 from linkax.simulation.given import check_accuracy, checked_state, checked_time
 from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.options import (
@@ -95,7 +95,8 @@ def simulate(
     **Raises:** `ValueError` for bad arguments; `SimulationError`, which holds the `.solution` so
     far, where the run ends early: loops that do not close, numbers that are not finite,
     `max_steps` reached, a step size that falls to nothing. Warns (`AccuracyWarning`), outside JAX
-    transformations, where rounding keeps accelerations from the tolerance: a body carries one far longer.
+    transformations, where rounding keeps the run from its tolerance: a body carries one far longer, or branches of
+    the motion are too close to each other.
     """
     dtype, t0, t1 = floating(dtype), checked_time(t0, "t0"), checked_time(t1, "t1")
     if known(t0) is not None and known(t1) is not None and not t1 > t0:
@@ -167,11 +168,12 @@ def simulate(
     )
     if all_known((found, end, saved)):
         rtol, _ = control.tolerances((accuracy.rtol, None))
+        in_doubt = uncertain_branch(found.closest, found.average)
         if result_name(solution.result) not in ENDED_WELL:
             if throw:
-                raise _failure(solution, state)
-        elif why := lost_accuracy(mechanism, outset.definiteness, rtol):
-            warnings.warn(why, AccuracyWarning, stacklevel=2)
+                raise _failure(solution, state, in_doubt)
+        elif why := lost_accuracy(mechanism, outset.definiteness, rtol) or in_doubt:
+            warnings.warn(why.lstrip(), AccuracyWarning, stacklevel=2)
     return solution
 
 
@@ -239,7 +241,10 @@ def _saves_states(saveat) -> bool:
 
 
 class _Found(NamedTuple):
-    """What the integration leaves: times and values saved, those at its end, and how it ended."""
+    """What the integration leaves: times and values saved, those at its end, and how it ended.
+
+    `closest`, `average`: the smallest and the mean distance from a singular configuration.
+    """
 
     ts: Any
     ys: Any
@@ -248,6 +253,7 @@ class _Found(NamedTuple):
     stats: dict
     result: RESULTS
     closest: Array
+    average: Array
     interpolation: Any
 
 
@@ -351,7 +357,8 @@ class _Integration(eqx.Module):
         result = _result(found.result, self.outset, self.in_order, self.controller.is_adaptive)
         closest = found.solver_state[2]
         steps = Steps(times[0], states[0], found.stats["num_accepted_steps"]) if track else None
-        return _Found(ts, ys, t_end[0], y_end[0], found.stats, result, closest, found.interpolation), steps
+        average = y_end[0, -1] / (t_end[0] - course.t0)
+        return _Found(ts, ys, t_end[0], y_end[0], found.stats, result, closest, average, found.interpolation), steps
 
     def rows(self, y0, saved, end):
         """What diffrax saves, of values at the start, at saved times, and at the end."""
@@ -392,8 +399,8 @@ def _result(result, outset, in_order, is_adaptive):
     return RESULTS.where(in_order, result, RESULTS.times_out_of_order)
 
 
-def _failure(solution, state) -> SimulationError:
-    """Where and why a run failed."""
+def _failure(solution, state, otherwise) -> SimulationError:
+    """Where and why a run failed, `otherwise` where no element is to blame."""
     at_start = (
         "times_out_of_order",
         "not_finite",
@@ -405,4 +412,5 @@ def _failure(solution, state) -> SimulationError:
     )
     before = any(solution.result == getattr(RESULTS, name) for name in at_start)
     when = "before it began" if before else f"at t = {float(solution.t_end):.6g} s"
-    return SimulationError(f"simulation stopped {when}: {RESULTS[solution.result]}{cause(solution, state)}", solution)
+    why = cause(solution, state) or otherwise
+    return SimulationError(f"simulation stopped {when}: {RESULTS[solution.result]}{why}", solution)
