@@ -47,6 +47,13 @@ def runs_once(function):
     return wraps(function)(partial(compiled(function), once=True))
 
 
+def pushed_forward(function, primals, changes):
+    """Value and change of a function, like `equinox.filter_jvp`, which gives None for no change; this gives zeros."""
+    found, change = eqx.filter_jvp(function, primals, changes)
+    numbers, _ = eqx.partition(found, eqx.is_inexact_array)
+    return found, jax.tree.map(lambda of, to: jnp.zeros_like(of) if to is None else to, numbers, change)
+
+
 def in_one_kernel(function, sound, *args):
     """function(*args), as one kernel of the CPU where that can be; no numbers where `sound` is false.
 

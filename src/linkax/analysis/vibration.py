@@ -26,7 +26,7 @@ from linkax.simulation.assembly import CLOSED, LONGEST_STEP
 from linkax.simulation.diagnosis import massless_bodies
 from linkax.simulation.given import checked_state, checked_time
 from linkax.simulation.state import State
-from linkax.tracing import all_known, runs_once
+from linkax.tracing import all_known, pushed_forward, runs_once
 
 MOST_STEPS = 200
 AT_REST = 1e-12  # step [rad, lengths of the mechanism] below which the search for an equilibrium ends
@@ -216,13 +216,13 @@ def _at_rest_jvp(primals, changes):
     still = _Still.of(system, _STATICS.method(system.dtype), t, q)
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
     force = lambda system, t: dataclasses.replace(still, system=system, t=t).force(rest)
-    _, unbalanced = eqx.filter_jvp(force, (system, t), (system_change, t_change))
+    _, unbalanced = pushed_forward(force, (system, t), (system_change, t_change))
     change = jnp.linalg.pinv(still.at_rest()[1], rtol=NEUTRAL) @ unbalanced
 
     def moved(system, t, y):
         return still.method.close(system, t, retract(system.topology, q, still.basis @ y), rest)[0]
 
-    _, q_change = eqx.filter_jvp(moved, (system, t, rest), (system_change, t_change, change))
+    _, q_change = pushed_forward(moved, (system, t, rest), (system_change, t_change, change))
     return (q, longest), (q_change, None)
 
 

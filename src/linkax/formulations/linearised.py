@@ -18,6 +18,7 @@ from linkax.equations.dynamics import unbalanced_force
 from linkax.equations.loops import gamma, jacobian, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
+from linkax.tracing import pushed_forward
 
 
 class Changes(NamedTuple):
@@ -56,14 +57,14 @@ def moved(onto: Callable | None, system: System, t, q, v, changes: Changes) -> M
     if onto is not None:
         open_ = lambda system, t, q: residual(configure(system, t, q))
         to_q = rates(topology, q, along)
-        _, opens = eqx.filter_jvp(open_, (system, t, q), (changes.system, changes.t, to_q))
+        _, opens = pushed_forward(open_, (system, t, q), (changes.system, changes.t, to_q))
         along = along - onto(opens)
     to_q = rates(topology, q, along)
     configuration, to_configuration = eqx.filter_jvp(configure, (system, t, q), (changes.system, changes.t, to_q))
     rows, to_rows = eqx.filter_jvp(jacobian, (configuration,), (to_configuration,))
     if onto is not None:
         asked = lambda configuration, rows, v: rows @ v - rate(configuration.system, configuration.t)
-        _, missed = eqx.filter_jvp(asked, (configuration, rows, v), (to_configuration, to_rows, to_v))
+        _, missed = pushed_forward(asked, (configuration, rows, v), (to_configuration, to_rows, to_v))
         to_v = to_v - onto(missed)
     return Moved(configuration, rows, v, to_configuration, to_rows, to_q, to_v)
 
@@ -76,5 +77,4 @@ def unbalanced(state: Moved, acceleration, multipliers):
         return unbalanced_force(motion, acceleration) + rows.T @ multipliers, gamma(motion) - rows @ acceleration
 
     at = state.configuration, state.jacobian, state.v
-    found, changes = eqx.filter_jvp(sides, at, (state.to_configuration, state.to_jacobian, state.to_v))
-    return tuple(jnp.zeros_like(of) if change is None else change for of, change in zip(found, changes, strict=True))
+    return pushed_forward(sides, at, (state.to_configuration, state.to_jacobian, state.to_v))[1]

@@ -20,7 +20,7 @@ from linkax.simulation.given import Given, by_joint, check_mechanism, checked_ti
 from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
-from linkax.tracing import all_known, runs_once
+from linkax.tracing import all_known, pushed_forward, runs_once
 
 MOST_STEPS = 100
 LONGEST_STEP = 0.7  # radians, or lengths of the mechanism
@@ -284,7 +284,7 @@ def _on_branch_jvp(primals, changes):
     """Where nothing is left over, to any order: the Newton steps have no derivative."""
     (asked, begin), (change, begins) = primals, changes
     v = _on_branch(asked, begin)
-    opens = eqx.filter_jvp(lambda asked: asked.rest(v), (asked,), (change,))[1]
+    opens = pushed_forward(lambda asked: asked.rest(v), (asked,), (change,))[1]
     return v, _nearest(asked.system, jnp.zeros_like(v) if begins is None else begins, asked.slopes(v), opens)
 
 
@@ -329,9 +329,8 @@ def _found_jvp(primals, changes):
     q, topology = _found(demand, begin), demand.system.topology
     along = jnp.zeros_like(demand.system.units) if begins is None else speeds(topology, begin, begins)
     at_rest = lambda demand: demand.rows(configure(demand.system, demand.t, q))
-    rows, opens = eqx.filter_jvp(at_rest, (demand,), (change,))
-    closes = jnp.zeros_like(rows) if opens is None else -opens
-    along = _nearest(demand.system, along, demand.linearised(q)[1], closes)
+    rows, opens = pushed_forward(at_rest, (demand,), (change,))
+    along = _nearest(demand.system, along, demand.linearised(q)[1], -opens)
     # Loops that do not close stay as open as they were found.
     return q, rates(topology, q, jnp.where(_size(rows) <= CLOSED, along, 0.0))
 

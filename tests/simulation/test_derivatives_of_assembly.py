@@ -1,0 +1,81 @@
+"""Derivatives of assembled states: by every number of every scene alone, whether or not it moves a loop."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_gradients import central_differences
+
+import linkax as lx
+from linkax.scenes import SCENES
+
+QUICK = ("pendulum", "crank-slider")
+SCENE_NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SCENES]
+
+
+class Numbers:
+    """The numbers of a scene's mechanism, and its assembled state as a function of them."""
+
+    def __init__(self, name):
+        self.scene = SCENES[name]
+        self.settings = self.scene.settings(None, {"N": 2} if name == "n-four-bar" else {})
+        leaves, self.structure = jax.tree.flatten(self.scene.mechanism(self.settings))
+        self.leaves = [jnp.asarray(leaf) for leaf in leaves]
+        self.changeable = [i for i, leaf in enumerate(self.leaves) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+
+    def state(self, leaves):
+        """q and v, in one vector."""
+        state = self.scene.initial(jax.tree.unflatten(self.structure, leaves), self.settings)
+        return jnp.concatenate([state.q, state.v])
+
+    def alone(self, index):
+        """The state as a function of one leaf."""
+        return lambda leaf: self.state([*self.leaves[:index], leaf, *self.leaves[index + 1 :]])
+
+
+@pytest.mark.parametrize("name", SCENE_NAMES)
+def test_every_leaf_alone_has_a_derivative_in_both_modes(name):
+    """Each is traced alone, as JAX tells rules which inputs do not change."""
+    numbers = Numbers(name)
+    for index in numbers.changeable:
+        leaf, state = numbers.leaves[index], numbers.alone(index)
+        jax.eval_shape(jax.grad(lambda leaf, state=state: jnp.sum(state(leaf))), leaf)
+        jax.eval_shape(lambda leaf, state=state: jax.jvp(state, (leaf,), (leaf,))[1], leaf)
+
+
+@pytest.mark.parametrize("name", SCENE_NAMES)
+def test_derivatives_agree_with_differences(name):
+    """To 1e-6, where loops can be closed with a number changed alone."""
+    numbers = Numbers(name)
+    sizes = [numbers.leaves[i].size for i in numbers.changeable]
+    places = np.cumsum(sizes)[:-1]
+
+    def state(flat):
+        leaves = list(numbers.leaves)
+        for index, part in zip(numbers.changeable, jnp.split(flat, places), strict=True):
+            leaves[index] = part.reshape(leaves[index].shape)
+        return numbers.state(leaves)
+
+    at = jnp.concatenate([numbers.leaves[i].ravel() for i in numbers.changeable])
+    forwards = jax.jit(jax.jacfwd(state))(at)
+    with np.errstate(invalid="ignore"):  # speeds are infinite where loops do not close
+        differences = central_differences(jax.jit(state), at)
+    relative = np.asarray(forwards) * np.where(at == 0.0, 1.0, np.abs(at))
+    closes = np.all(np.isfinite(differences), axis=0)
+    assert np.mean(closes) > 0.5
+    np.testing.assert_allclose(relative[:, closes], differences[:, closes], atol=1e-6)
+
+
+def test_fit_of_a_mass_alone():
+    """That no loop depends on, with the state assembled inside of the residual."""
+
+    def angle(params):
+        arm = lx.rod("arm", length=1.0, mass=params["mass"])
+        hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
+        forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointSpring("hinge", 20.0)]
+        mechanism = lx.Mechanism([arm], [hinge], forces)
+        return lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": 0.4}), t1=1.0).joint("hinge")
+
+    measured = angle({"mass": 1.3})
+    found = lx.fit(lambda params, measured: angle(params) - measured, {"mass": 1.0}, (measured,), progress=False)
+    np.testing.assert_allclose(found.params["mass"], 1.3, rtol=1e-6)
