@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.interpreters import ad
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from linkax.simulation.integration import Problem, Projected
@@ -67,7 +67,9 @@ def tangents(solver: Projected, course: Course, steps: Steps, changes: Course, e
     `every`: at all steps too. Linear in the changes, and differentiable: once backwards, or forwards any number of
     times.
     """
-    return eqxi.filter_primitive_bind(_tangents_p, solver, every, course, steps, changes)
+    # In one array, which is one of a batch where anything is: JAX could not transpose a batch with changes in common.
+    flat, restored = ravel_pytree(changes)
+    return eqxi.filter_primitive_bind(_tangents_p, solver, every, course, steps, restored, flat + (steps.count < 0))
 
 
 class _Tableau(NamedTuple):
@@ -154,8 +156,9 @@ def _within(solver: Projected, t0, t1, dense, t):
     return solver.interpolation_cls(t0=t0, t1=t1, **dense).evaluate(t)
 
 
-def _forwards(solver, every, course, steps, changes) -> Motion:
+def _forwards(solver, every, course, steps, restored, flat) -> Motion:
     """Tangents, step by step."""
+    changes = restored(flat)
     saved, y0, last = course.saved, course.y0, steps.count - 1
     saved_dot = None if saved is None else _zero(saved, changes.saved)
 
@@ -292,7 +295,7 @@ def _change(found, integration, course, changes, motion):
 # As a primitive of JAX, linear in its last argument: only so can one function have a forward and a backward rule.
 
 
-def _abstract(solver, every, course, steps, changes):
+def _abstract(solver, every, course, steps, restored, flat):
     n = course.y0.shape
     of = lambda shape: jax.core.ShapedArray(shape, course.y0.dtype)
     saved = None if course.saved is None else of(course.saved.shape + n)
@@ -306,14 +309,14 @@ def _jvp(primals, changes):
 
 @eqxi.filter_primitive_transpose(materialise_zeros=True)
 def _transpose(inputs, cotangent):
-    solver, every, course, steps, changes = inputs
+    solver, every, course, steps, restored, flat = inputs
     if every:
         raise NotImplementedError(NO_REVERSE)
-    is_leaf = lambda leaf: leaf is None or ad.is_undefined_primal(leaf)
-    wanted = jax.tree.map(ad.is_undefined_primal, changes, is_leaf=is_leaf)
-    found = _backwards(solver, course, steps, wanted, cotangent)
+    changes = jax.eval_shape(restored, flat.aval)
+    wanted = jax.tree.map(lambda change: change is not None, changes, is_leaf=lambda leaf: leaf is None)
+    found, _ = ravel_pytree(_backwards(solver, course, steps, wanted, cotangent))
     none = lambda tree: jax.tree.map(lambda _: None, tree)
-    return none(solver), none(every), none(course), none(steps), found
+    return none(solver), none(every), none(course), none(steps), None, found
 
 
 _tangents_p = eqxi.create_vprim(

@@ -35,6 +35,7 @@ from linkax.simulation.results import ENDED_WELL, RESULTS, AccuracyWarning, Simu
 from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
+from linkax.simulation.undefined import undefined_where
 from linkax.tracing import all_known, compiled, runs_once
 
 DEFAULT_SAVES = 201
@@ -82,7 +83,9 @@ def simulate(
     - `adjoint`: of diffrax. By default both modes work, over the steps that the run took, where the solver is an
       explicit Runge-Kutta method and states are saved, without event and dense output; elsewhere it is
       `RecursiveCheckpointAdjoint`, for reverse mode. `ForwardMode` serves forward mode alone.
-    - `event`: as in diffrax; condition functions get (t, state, mechanism).
+    - `event`: as in diffrax; condition functions get (t, state, mechanism). With a `root_finder` the run ends at the
+      event, and its end has derivatives (`RecursiveCheckpointAdjoint` backwards, `ForwardMode` forwards). Without one
+      it ends with the step in which the event occurs: derivatives of its end are not a number.
     - `dtype`: floating-point type of the whole computation, default double precision.
     - `dt0`, `max_steps`, `progress_meter`: as in diffrax.
     - `optimise`: False compiles in less than half of the time a program that takes three to eight times as long:
@@ -94,9 +97,9 @@ def simulate(
 
     **Raises:** `ValueError` for bad arguments; `SimulationError`, which holds the `.solution` so
     far, where the run ends early: loops that do not close, numbers that are not finite,
-    `max_steps` reached, a step size that falls to nothing. Warns (`AccuracyWarning`), outside JAX
-    transformations, where rounding keeps the run from its tolerance: a body carries one far longer, or branches of
-    the motion are too close to each other.
+    `max_steps` reached, a step size that falls to nothing. Derivatives of such a run are not a number.
+    Warns (`AccuracyWarning`), outside JAX transformations, where rounding keeps the run from its tolerance: a body
+    carries one far longer, or branches of the motion are too close to each other.
     """
     dtype, t0, t1 = floating(dtype), checked_time(t0, "t0"), checked_time(t1, "t1")
     if known(t0) is not None and known(t1) is not None and not t1 > t0:
@@ -195,8 +198,8 @@ class _OnManifold(eqx.Module):
 
     function: callable
 
-    def __call__(self, t, y, problem, **unused):
-        return self.function(t, problem.close(t, y), problem.mechanism)
+    def __call__(self, t, y, args, **unused):  # diffrax passes `args` by name where it seeks the root of an event
+        return self.function(t, args.close(t, y), args.mechanism)
 
 
 def _wrapped_saves(subs):
@@ -290,8 +293,30 @@ def _integrate(
         outset, in_order, dt0, saveat, solver, controller, adjoint, event, progress_meter, max_steps
     )
     if replayed:
-        return integrate(Course(problem, y0, t0, t1, saveat.subs.ts), integration), formulation
-    return integration(Course(problem, y0, t0, t1, None), False)[0], formulation
+        found = integrate(Course(problem, y0, t0, t1, saveat.subs.ts), integration)
+    else:
+        found = integration(Course(problem, y0, t0, t1, None), False)[0]
+    return _without_derivatives(found, event, (mechanism, outset.state, t0, t1, dt0, saveat)), formulation
+
+
+def _without_derivatives(found: _Found, event, inputs) -> _Found:
+    """What was found: without derivatives where the run failed, or ended with a step that an event ended."""
+    failed = jnp.logical_not(jnp.stack([found.result == getattr(RESULTS, name) for name in ENDED_WELL]).any())
+    at_end = failed
+    if event is not None and event.root_finder is None:
+        at_end = failed | (found.result == RESULTS.event_occurred)
+    of_times = lambda ts: failed | (at_end & (ts >= found.t_end))
+    of_values = lambda ts, ys: jax.tree.map(lambda y: of_times(ts).reshape(-1, *(1,) * (y.ndim - 1)), ys)
+    values, fixed = eqx.partition((found.ts, found.ys, found.t_end, found.y_end), eqx.is_inexact_array)
+    undefined = (
+        jax.tree.map(of_times, values[0]),
+        jax.tree.map(of_values, values[0], values[1]),
+        at_end,
+        at_end,
+    )
+    values = undefined_where(undefined, values, eqx.filter(inputs, eqx.is_inexact_array))
+    ts, ys, t_end, y_end = eqx.combine(values, fixed)
+    return found._replace(ts=ts, ys=ys, t_end=t_end, y_end=y_end)
 
 
 def _in_order(t0, t1, dt0, saveat):

@@ -1,0 +1,111 @@
+"""Events, and derivatives that do not exist."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import linkax as lx
+
+FINE = lx.Accuracy(rtol=1e-11)
+ROOT = optx.Newton(1e-12, 1e-12)
+MODES = [(diffrax.RecursiveCheckpointAdjoint(), jax.jacrev), (diffrax.ForwardMode(), jax.jacfwd)]
+in_both_modes = pytest.mark.parametrize(("adjoint", "derivative"), MODES, ids=["backwards", "forwards"])
+
+
+def rotor(torque, **options):
+    """A rotor of inertia one, at rest, driven by a constant torque."""
+    disc = lx.RigidBody("disc", 1.0, [0.0, 0.0, 0.0], jnp.ones(3))
+    hinge = lx.Revolute("hinge", lx.GROUND, disc, axis="z")
+    mechanism = lx.Mechanism([disc], [hinge], [lx.JointTorque("hinge", torque)])
+    return lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), accuracy=FINE, **options)
+
+
+def driven(length, **options):
+    """A crank-slider whose crank of one metre turns by one radian a second."""
+    crank, rod, slider = lx.rod("crank", 1.0, 1.0), lx.rod("rod", length, 1.0), lx.point_mass("slider", 1.0)
+    joints = [
+        lx.Revolute("bearing", lx.GROUND, crank.at("base"), axis="z"),
+        lx.Revolute("crank_pin", crank.at("tip"), rod.at("base"), axis="z"),
+        lx.Revolute("wrist_pin", rod.at("tip"), slider, axis="z"),
+        lx.Prismatic("guide", lx.GROUND, slider, axis="x"),
+    ]
+    mechanism = lx.Mechanism([crank, rod, slider], joints, constraints=[lx.Drive("motor", "bearing", 0.5, 1.0)])
+    return lx.simulate(mechanism, lx.assemble(mechanism), accuracy=FINE, **options)
+
+
+def turned(t, state, mechanism):
+    return state.q[0] - 2.0
+
+
+@in_both_modes
+def test_root_of_an_event_against_the_closed_form(adjoint, derivative):
+    """½ T t² = 2: t = 2 / √T, and the speed there is 2 √T."""
+
+    def end(torque):
+        found = rotor(torque, t1=5.0, event=diffrax.Event(turned, ROOT), adjoint=adjoint)
+        return jnp.stack([found.t_end, found.end.q[0], found.end.v[0]])
+
+    exact = lambda torque: jnp.stack([2.0 / jnp.sqrt(torque), 2.0 + 0.0 * torque, 2.0 * jnp.sqrt(torque)])
+    np.testing.assert_allclose(jax.jit(end)(1.5), exact(1.5), atol=1e-9)
+    np.testing.assert_allclose(jax.jit(derivative(end))(1.5), derivative(exact)(1.5), atol=1e-8)
+
+
+@pytest.mark.slow
+@in_both_modes
+def test_root_of_an_event_in_a_loop(adjoint, derivative):
+    """The slider of a driven crank reaches cos(a) + √(l² − sin²(a)) = 1.6, a = 0.5 + t."""
+
+    def end(length):
+        reaches = lambda t, state, mechanism: lx.Solution.of_state(mechanism, state, t=t).position("slider")[0, 0] - 1.6
+        return driven(length, t1=3.0, event=diffrax.Event(reaches, ROOT), adjoint=adjoint).t_end
+
+    def exact(length):
+        cosine = (1.6**2 + 1.0 - length**2) / (2.0 * 1.6)
+        return jnp.arccos(cosine) - 0.5
+
+    np.testing.assert_allclose(jax.jit(end)(1.8), exact(1.8), atol=1e-9)
+    np.testing.assert_allclose(jax.jit(derivative(end))(1.8), derivative(exact)(1.8), atol=1e-8)
+
+
+@in_both_modes
+def test_end_of_a_step_has_no_derivative(adjoint, derivative):
+    """Without a root finder a run ends with a step, which follows no number: saved times before it do."""
+
+    def motion(torque):
+        saveat = diffrax.SaveAt(ts=[0.5], t1=True)
+        found = rotor(torque, t1=5.0, event=diffrax.Event(turned), adjoint=adjoint, saveat=saveat)
+        return jnp.stack([found.q[0, 0], found.q[1, 0], found.t_end, found.end.q[0]])
+
+    slopes = jax.jit(derivative(motion))(1.5)
+    np.testing.assert_allclose(slopes, [0.125, np.nan, np.nan, np.nan], atol=1e-8)
+
+
+ADJOINTS = [None, *(pytest.param(adjoint, marks=pytest.mark.slow) for adjoint, _ in MODES)]
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_failed_run_has_no_derivative(adjoint):
+    """It is NaN, not zero; and a member that a loss leaves out spoils the derivative of no other."""
+
+    def end(length, gravity):
+        arm = lx.rod("arm", length, 1.0)
+        hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
+        mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -gravity, 0.0])])
+        start = lx.assemble(mechanism, {"hinge": 0.3})
+        found = lx.simulate(mechanism, start, t1=2.0, max_steps=40, adjoint=adjoint)
+        return found.end.q[0], found.result == lx.RESULTS.successful
+
+    def total(gravity):
+        angles, went_well = jax.vmap(end, in_axes=(0, None))(lengths, gravity)
+        return jnp.sum(jnp.where(went_well, angles, 0.0))
+
+    lengths = jnp.array([0.02, 1.0, 2.0])  # the shortest takes more steps
+    modes = [derivative for own, derivative in MODES if adjoint is None or type(own) is type(adjoint)]
+    for derivative in modes:
+        slopes, went_well = jax.jit(jax.vmap(derivative(end, 1, has_aux=True), in_axes=(0, None)))(lengths, 9.81)
+        np.testing.assert_array_equal(went_well, [False, True, True])
+        np.testing.assert_array_equal(np.isfinite(slopes), went_well)
+        np.testing.assert_allclose(jax.jit(derivative(total))(9.81), np.sum(slopes[1:]), rtol=1e-12)
