@@ -93,6 +93,30 @@ def _undefined(shape):
     return jnp.full(shape.shape, jnp.nan if jnp.issubdtype(shape.dtype, jnp.inexact) else 0, shape.dtype)
 
 
+def one_by_one(function):
+    """A function of pytrees that calls LAPACK, for one member of a batch after another on a CPU.
+
+    jaxlib (0.10) spreads a LAPACK call for a batch over the threads that the program itself runs in, and waits for
+    them: two such calls at once wait for each other for ever. Derivatives are those of the function as it is.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def single(*arrays):
+        return function(*arrays)
+
+    @single.def_vmap
+    def _(size, batched, *arrays):
+        each = lambda array, of_batch: array if of_batch else jnp.broadcast_to(array, (size, *jnp.shape(array)))
+        arrays = jax.tree.map(each, arrays, tuple(batched))
+        mapped = lambda *arrays: lax.map(lambda members: single(*members), arrays)
+        found = lax.platform_dependent(*arrays, cpu=mapped, default=jax.vmap(function))
+        return found, jax.tree.map(lambda _: True, found)
+
+    differentiable = jax.custom_jvp(single)
+    differentiable.defjvp(lambda primals, changes: jax.jvp(function, primals, changes))
+    return differentiable
+
+
 def differentiated_whole(function):
     """A function (static, *arrays) of few numbers each whose derivative is found once, for all directions.
 

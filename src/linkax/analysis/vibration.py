@@ -26,7 +26,7 @@ from linkax.simulation.assembly import CLOSED, LONGEST_STEP
 from linkax.simulation.diagnosis import massless_bodies
 from linkax.simulation.given import checked_state, checked_time
 from linkax.simulation.state import State
-from linkax.tracing import all_known, pushed_forward, runs_once
+from linkax.tracing import all_known, one_by_one, pushed_forward, runs_once
 
 MOST_STEPS = 200
 AT_REST = 1e-12  # step [rad, lengths of the mechanism] below which the search for an equilibrium ends
@@ -34,6 +34,9 @@ BALANCED_STEP = 1e-8  # the same, above which it has failed
 OVERSHOOT = 0.5  # of the work on a step, which forces may do against it at its end
 NEUTRAL = 1e-12  # stiffness relative to the largest that counts as none
 
+_eigh = one_by_one(jnp.linalg.eigh)
+_eigenvalues = jnp.vectorize(one_by_one(jnp.linalg.eigvals), signature="(n,n)->(n)")
+_pseudo_inverse = one_by_one(lambda matrix: jnp.linalg.pinv(matrix, rtol=NEUTRAL))
 
 # Mechanisms at rest need no mass, and forces differ less between soft and stiff directions than accelerations do.
 _STATICS = Accuracy(metric="identity")
@@ -191,7 +194,7 @@ def _at_rest(system, t, q):
         q, _ = method.close(system, t, retract(system.topology, search.q, search.step), rest)
         still = _Still.of(system, method, t, q)
         force, stiffness = still.at_rest()
-        values, vectors = jnp.linalg.eigh((stiffness + stiffness.T) / 2.0)
+        values, vectors = _eigh((stiffness + stiffness.T) / 2.0)
         stiff = jnp.abs(values) > NEUTRAL * jnp.max(jnp.abs(values))
         along = vectors.T @ force
         downhill = vectors @ jnp.where(stiff, along / jnp.where(stiff, jnp.abs(values), 1.0), along)
@@ -217,7 +220,7 @@ def _at_rest_jvp(primals, changes):
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
     force = lambda system, t: dataclasses.replace(still, system=system, t=t).force(rest)
     _, unbalanced = pushed_forward(force, (system, t), (system_change, t_change))
-    change = jnp.linalg.pinv(still.at_rest()[1], rtol=NEUTRAL) @ unbalanced
+    change = _pseudo_inverse(still.at_rest()[1]) @ unbalanced
 
     def moved(system, t, y):
         return still.method.close(system, t, retract(system.topology, q, still.basis @ y), rest)[0]
@@ -250,7 +253,7 @@ class Linearisation(NamedTuple):
         """Of the motion with damping [1/s]; with first derivatives alone."""
         nothing = jnp.zeros_like(self.stiffness)
         identity = nothing + jnp.eye(nothing.shape[-1])
-        return jnp.linalg.eigvals(jnp.block([[nothing, identity], [-self.stiffness, -self.damping]]))
+        return _eigenvalues(jnp.block([[nothing, identity], [-self.stiffness, -self.damping]]))
 
 
 def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: int | None = None) -> Linearisation:
@@ -295,7 +298,7 @@ def _linearise(mechanism, state, t, count):
     at_columns = lambda matrix: matrix[columns[:, None], columns[None, :]]
     _, slopes = moving.slopes(lambda both: moving.acceleration(*jnp.split(both, 2)), jnp.concatenate([rest, rest]))
     stiffness, damping = (at_columns(-part) for part in jnp.split(slopes, 2, axis=1))
-    values, vectors = jnp.linalg.eigh((stiffness + stiffness.T) / 2.0)
+    values, vectors = _eigh((stiffness + stiffness.T) / 2.0)
     basis = moving.basis[:, columns]
     found = Linearisation(
         natural_frequencies=jnp.sign(values) * jnp.sqrt(jnp.where(values == 0.0, 1.0, jnp.abs(values))),

@@ -16,7 +16,7 @@ from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
 from linkax.model.numbers import known, number, whole_number
-from linkax.tracing import traced_once
+from linkax.tracing import one_by_one, traced_once
 
 
 def parameter(default: float, what: str):
@@ -60,6 +60,11 @@ class Baumgarte(eqx.Module):
 
     alpha: np.ndarray = parameter(5.0, "alpha of Baumgarte [1/s]")
     beta: np.ndarray = parameter(5.0, "beta of Baumgarte [1/s]")
+
+
+_solve = one_by_one(jnp.linalg.solve)
+_accelerate = one_by_one(lambda acceleration, *equations: acceleration(*equations))
+_right_inverse = one_by_one(lambda correction, mass, jacobian: correction.right_inverse(mass, jacobian))
 
 
 def _in_units(at: Coefficients):
@@ -114,11 +119,11 @@ class ClassicalFormulation(AbstractFormulation):
         force, right, units = generalised_force(motion), gamma(motion), system.units
         mass, rows = _in_units(at)
         if system.topology.num_rows == 0:
-            return Dynamics(units * jnp.linalg.solve(mass, units * force), right, right)
+            return Dynamics(units * _solve(mass, units * force), right, right)
         open_, rate_open = residual(at.configuration), at.jacobian @ v - rate(system, at.configuration.t)
         alpha, beta = self.stabilisation.alpha, self.stabilisation.beta
         stabilised = right - 2.0 * alpha * rate_open - beta**2 * open_
-        acceleration, multipliers = self.acceleration(mass, rows, units * force, stabilised)
+        acceleration, multipliers = _accelerate(self.acceleration, mass, rows, units * force, stabilised)
         acceleration = units * acceleration
         return Dynamics(acceleration, multipliers, at.jacobian @ acceleration - right)
 
@@ -136,7 +141,7 @@ class ClassicalFormulation(AbstractFormulation):
 
         def inverse(q):
             at = coefficients(system, t, q)
-            return at, system.units[:, None] * self.correction.right_inverse(*_in_units(at))
+            return at, system.units[:, None] * _right_inverse(self.correction, *_in_units(at))
 
         def closer(_, q):
             at, back = inverse(q)

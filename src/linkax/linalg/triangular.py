@@ -1,7 +1,6 @@
 """Inverses of triangular factors, for one matrix by LAPACK, for batches of small ones in compiled loops.
 
-A batch of small matrices spends its time in calling LAPACK. And jaxlib (0.10) lets a call for a batch wait for threads
-of the pool that it runs in itself: several programs at once on one CPU can wait for each other for ever.
+A batch of small matrices spends its time in calling LAPACK. Larger ones are given to it one by one.
 """
 
 import math
@@ -11,6 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
+
+from linkax.tracing import one_by_one
 
 SMALL = 32  # rows, up to which elimination serves batches
 
@@ -75,7 +76,7 @@ def _for_batches(single, batched):
         outer, shape = matrix.shape[:-2], matrix.shape[-2:]
         if not outer:
             return (batched if shape[0] <= SMALL else single)(matrix)
-        mapped = jax.vmap(batched if shape[0] <= SMALL else single)
+        mapped = jax.vmap(batched if shape[0] <= SMALL else one_by_one(single))
         found = mapped(matrix.reshape(math.prod(outer), *shape))
         return jax.tree.map(lambda part: part.reshape(*outer, *part.shape[1:]), found)
 
