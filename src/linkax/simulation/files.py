@@ -3,15 +3,18 @@
 import contextlib
 import os
 import tempfile
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
+
+UNFINISHED = ".unfinished-"
 
 
 def writable_folder(path: Path, remedy: str) -> Path:
     """A folder, made where it is not there, and tried before work is done whose results are to go there."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
+        with tempfile.TemporaryFile(dir=path, prefix=UNFINISHED):
             return path
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -19,11 +22,34 @@ def writable_folder(path: Path, remedy: str) -> Path:
 
 
 @contextlib.contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
-    """A temporary path to write to, renamed to `path` once all went well, and removed otherwise."""
-    unfinished = path.with_name(f".unfinished-{os.getpid()}-{path.name}")
+def written_whole(path: Path, exclusive: bool = False) -> Iterator[Path]:
+    """A temporary path to write to, renamed to `path` once all went well and is on disk, and removed otherwise.
+
+    **Raises:** `FileExistsError` where `exclusive`, and another process was first.
+    """
+    # A name that no other process has, on another machine neither.
+    unfinished = path.with_name(f"{UNFINISHED}{os.getpid()}-{uuid.uuid4().hex}-{path.name}")
     try:
         yield unfinished
-        unfinished.replace(path)
+        synced(unfinished)
+        if exclusive:
+            _place(unfinished, path)
+        else:
+            unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def _place(unfinished, path):
+    try:
+        os.link(unfinished, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        unfinished.replace(path)
+
+
+def synced(path: Path):
+    """Wait until a file is on disk, whatever happens to the power then."""
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
