@@ -93,10 +93,13 @@ def sweep(
     - `difficulty`: numbers (n,), or a function of params that gives one, such as the steps of a run at `linkax.DRAFT`.
       Members of like difficulty share a chunk: a chunk takes as long as its slowest member.
     - `store`: a folder, in which results are kept as they come, in Zarr format. A sweep that was killed goes on from
-      there; one of another function or other parameters is refused.
+      there, and what has been damaged is computed again; one of another function or other parameters is refused.
+      Processes that run the same sweep may share it.
     - `progress`: show a bar; default: where someone watches.
 
-    **Raises:** `ValueError` for a batch that is none, and for a store of another sweep.
+    **Raises:** `ValueError` for a batch that is none, for a store of another sweep, and for one that cannot be there.
+
+    **Warns:** of what is damaged in a store.
     """
     instance(function, Callable, "function", "give a function of one set of parameters")
     params = as_arrays(params, "params")
@@ -107,10 +110,15 @@ def sweep(
     if isinstance(memory, bool) or not isinstance(memory, numbers.Real) or not memory > 0:
         raise ValueError(f"memory is {memory!r}; it must be a positive number of bytes")
     if store is not None:
-        instance(store, str | os.PathLike, "store", "give the name of a folder")
-    order = _order(difficulty, params, count, dict(chunk=chunk, memory=memory, devices=devices))
+        store = SweepStore.folder(instance(store, str | os.PathLike, "store", "give the name of a folder"))
+        SweepStore.check("params", params)
     with progress_bar(count, "member", progress, smoothing=0.05) as bar:
-        program = _Program.compiled(function, params, chunk or min(DEFAULT_CHUNK, count), memory, devices)
+        one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), params)
+        shape = eqx.filter_eval_shape(function, one)
+        if store is not None:
+            SweepStore.check("output", eqx.filter(shape, _is_struct))
+        order = _order(difficulty, params, count, dict(chunk=chunk, memory=memory, devices=devices))
+        program = _Program.compiled(function, one, shape, chunk or min(DEFAULT_CHUNK, count), memory, devices)
         bar.set_description("sweeping")
         kept = None if store is None else SweepStore.opened(store, program, params, order, NOT_RUN)
         found, seconds, ran = _run(program, params, order, kept, bar)
@@ -118,6 +126,10 @@ def sweep(
     back = np.argsort(order)
     output = eqx.combine(jax.tree.map(lambda array: array[back], arrays), program.static)
     return Sweep(output, reasons[back], seconds / ran if ran else float("nan"))
+
+
+def _is_struct(leaf):
+    return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
 def _members(params) -> int:
@@ -203,11 +215,9 @@ class _Program(NamedTuple):
         return 1 if _calls_lapack(self.text) else _cores()
 
     @staticmethod
-    def compiled(function, params, chunk, memory, devices) -> "_Program":
-        one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), params)
-        shape = eqx.filter_eval_shape(function, one)
-        is_struct = lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct)
-        static = eqx.partition(shape, is_struct)[1]
+    def compiled(function, one, shape, chunk, memory, devices) -> "_Program":
+        """For parameters like `one`, of one member, and an output like `shape`."""
+        static = eqx.partition(shape, _is_struct)[1]
         while True:
             size = chunk * len(devices)
             batch = jax.tree.map(lambda leaf, size=size: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), one)
