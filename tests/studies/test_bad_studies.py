@@ -1,5 +1,6 @@
 """Sweeps, fits and their like refuse what makes no sense, by an error that names it."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -18,7 +19,7 @@ SWEEPS = {
     "params": [None, {}, 3.0, {"x": 1.0}, {"x": "abc"}, {"x": []}, {"x": np.zeros(3), "y": np.zeros(2)}, {"x": [None]}],
     "chunk": [0, -1, 1.5, "all", True, np.nan],
     "memory": [0, -1.0, np.nan, "much", None, 1j],
-    "devices": ["gpu", 3, [], ["cpu"]],
+    "devices": ["gpu", 3, [], ["cpu"], 2 * jax.local_devices()],
     "difficulty": ["hard", np.zeros(2), 3.0, {}, np.array(["a", "b", "c"]), [None, 1.0, 2.0]],
     "store": [3, 1.5],
 }  # fmt: skip

@@ -144,6 +144,8 @@ def _checked_devices(devices):
     devices = list(devices) if isinstance(devices, Iterable) else [devices]
     if not devices or not all(isinstance(device, jax.Device) for device in devices):
         raise ValueError(f"devices are {devices!r}; give a list of jax.local_devices(), or None for all of them")
+    if len(set(devices)) < len(devices):
+        raise ValueError(f"devices are {devices!r}; give each of them once")
     return devices
 
 
