@@ -210,11 +210,11 @@ class _Program(NamedTuple):
         """How many chunks are computed at once.
 
         Calls of LAPACK for batches, from programs that run at once on a CPU, may wait for each other for ever
-        (jaxlib 0.10: they wait for threads of the pool that they run in). A simulation makes none in a batch.
+        (jaxlib 0.10: they wait for threads of the pool that they run in). linkax makes none, see `linkax.tracing`.
         """
         if jax.default_backend() != "cpu":
             return 2  # one is computed while the results of another are copied
-        return 1 if _calls_lapack(self.text) else _cores()
+        return 1 if _calls_lapack_for_batches(self.text) else _cores()
 
     @staticmethod
     def compiled(function, one, shape, chunk, memory, devices) -> "_Program":
@@ -226,7 +226,7 @@ class _Program(NamedTuple):
             with jax.default_device(devices[0]):
                 lowered = jax.jit(_spread(jax.vmap(_member(function)), devices)).lower(batch)
                 text = lowered.as_text()
-                if len(devices) > 1 and devices[0].platform == "cpu" and _calls_lapack(text):
+                if len(devices) > 1 and devices[0].platform == "cpu" and _calls_lapack_for_batches(text):
                     devices = devices[:1]
                     continue
                 run = lowered.compile()
@@ -250,8 +250,9 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
-def _calls_lapack(text) -> bool:
-    return "@lapack_" in text or "@blas_" in text
+def _calls_lapack_for_batches(text) -> bool:
+    calls = (line for line in text.splitlines() if "@lapack_" in line or "@blas_" in line)
+    return any('num_batch_dims = "0"' not in line for line in calls)
 
 
 def _memory(compiled) -> int:
