@@ -24,6 +24,36 @@ def crank_slider(cut=None, order=1, offset=(0.0, 0.0, 0.0), rod=1.3):
     return lx.Mechanism([crank, link, slider], joints[::order], [lx.Gravity([0.0, -9.81, 0.0])])
 
 
+def sarrus():
+    """Two legs of two links in perpendicular planes, which carry a platform that only rises and falls."""
+    length, mass, width, out = 0.5, 0.5, 0.02, np.array([0.4, 0.0, 0.0])
+    moments = np.array([width**2 / 6, (length**2 + width**2) / 12, (length**2 + width**2) / 12])
+    link = lambda name: lx.RigidBody(
+        name, mass, [length / 2, 0.0, 0.0], jnp.asarray(mass * moments), {"tip": [length, 0.0, 0.0]}
+    )
+    platform = lx.RigidBody("platform", 2.0)
+    bodies, joints = [platform], []
+    for leg, turn in (("x", np.eye(3)), ("y", np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))):
+        lower, upper = link(f"lower_{leg}"), link(f"upper_{leg}")
+        bodies += [lower, upper]
+        joints += [
+            lx.Revolute(f"base_{leg}", lx.GROUND.at(turn @ out, turn), lower, axis="-y"),
+            lx.Revolute(f"knee_{leg}", lower.at("tip"), upper, axis="-y"),
+            lx.Revolute(f"top_{leg}", upper.at("tip"), platform.at(turn @ out, turn), axis="-y"),
+        ]
+    return lx.Mechanism(bodies, joints, [lx.Gravity([0.0, 0.0, -9.81])])
+
+
+def raised(angle, speeds):
+    """A Sarrus linkage whose legs stand at an angle from the ground [rad], both alike, with speeds of joints."""
+    mechanism = sarrus()
+    of_joint = {"base": angle, "knee": np.pi - 2.0 * angle, "top": angle - np.pi}
+    positions = {f"{name}_{leg}": value for name, value in of_joint.items() for leg in "xy"}
+    held = {name: positions[name] for name in ("base_x", "base_y", "knee_x", "knee_y")}
+    guess = {name: value for name, value in positions.items() if name in mechanism.topology.coordinates}
+    return mechanism, lx.assemble(mechanism, held, speeds, guess=guess)
+
+
 def with_cut(mechanism, name):
     """The same mechanism with another joint cut."""
 

@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from known_answers import start
+from known_answers import reference, start
+from mechanisms import raised
 from scipy.optimize import brentq
 from scipy.special import ellipeinc
 
@@ -160,3 +161,26 @@ def test_in_a_batch_a_start_without_branch_harms_no_other():
     np.testing.assert_allclose(found.q[others], undisturbed.q[others], atol=1e-9)
     with pytest.raises(ValueError, match="passages of a batch"):
         found.passages()
+
+
+@pytest.mark.parametrize("asked", [{"base_x": -5.0}, {"base_x": -5.0, "base_y": -5.0}, {"base_y": 3.0}])
+def test_speeds_of_some_joints_are_completed_to_a_branch(asked):
+    """Sarrus with straight legs, where each leg can turn either way: y² = x²."""
+    mechanism, state = raised(-np.pi / 2, asked)
+    solution = lx.Solution.of_state(mechanism, state)
+    speeds = {name: float(solution.joint_speed(name)[0]) for name in ("base_x", "base_y")}
+    for name, speed in asked.items():
+        assert speeds[name] == pytest.approx(speed, rel=1e-12)
+    assert abs(speeds["base_x"]) == pytest.approx(abs(speeds["base_y"]), rel=1e-9)
+
+
+@pytest.mark.parametrize("rtol", [1e-8, 1e-12])
+def test_sarrus_through_seven_passages(rtol):
+    """Redundant throughout; the rank falls by one and by two."""
+    known = reference("sarrus")
+    mechanism, state = raised(np.pi / 3, {"base_x": 0.0})
+    found = lx.simulate(
+        mechanism, state, t1=3.0, accuracy=lx.Accuracy(rtol=rtol), saveat=diffrax.SaveAt(ts=known["t"])
+    )
+    for name in ("base_x", "base_y"):
+        np.testing.assert_allclose(found.joint(name), known["gamma"], atol=max(1e3 * rtol, 3e-9))
