@@ -16,6 +16,7 @@ from refusals import Shown, refused
 
 import linkax as lx
 from linkax.simulation import assembly, simulate
+from linkax.simulation.given import sound_numbers
 
 MECHANISM = crank_slider()
 N_Q, N_V = MECHANISM.topology.num_coordinates, MECHANISM.topology.num_speeds
@@ -60,9 +61,11 @@ OPTIONS = {
     "stepsize_controller": [
         1e-3, "pid", diffrax.PIDController, diffrax.ConstantStepSize(), diffrax.PIDController(rtol=-1e-3, atol=1e-8),
         diffrax.PIDController(rtol=1e-3, atol=np.nan), diffrax.PIDController(rtol="fine", atol=1e-8),
-        diffrax.PIDController(rtol=jnp.asarray(np.inf), atol=1e-8),
+        diffrax.PIDController(rtol=jnp.asarray(np.inf), atol=1e-8), diffrax.PIDController(rtol=1e308, atol=1e-8),
     ],
-    "max_steps": [0, -5, 1.5, "many", True, np.nan],
+    "max_steps": [0, -5, 1.5, "many", True, np.nan, 10**400],
+    "optimise": ["no", None, 1.0, jnp.ones(3)],
+    "throw": ["no", None, 1.0, jnp.ones(3)],
     "adjoint": ["reverse", 3, diffrax.ForwardMode, diffrax.BacksolveAdjoint()],
     "event": [3, lambda t, state, mechanism: t > 1.0, diffrax.Event],
     "progress_meter": ["bar", True, diffrax.TextProgressMeter],
@@ -119,8 +122,8 @@ def test_an_unknown_option_is_named():
 
 
 ACCURACY = {
-    "rtol": [0.0, -1e-8, *NO_NUMBER[:8]],
-    "atol": [0.0, -1e-8, np.nan, "fine", True],
+    "rtol": [0.0, -1e-8, 2.0, 1e308, *NO_NUMBER[:8]],
+    "atol": [0.0, -1e-8, 1e308, np.nan, "fine", True],
     "rank_tolerance": [0.0, -1.0, np.inf, "fine"],
     "clearance": [-1e-2, np.nan, "far", True],
     "projection": ["always", None, True],
@@ -165,6 +168,13 @@ STATES = {
 def test_bad_states_are_named(reader, case):
     make, word = STATES[case]
     refused(lambda: READERS[reader](MECHANISM, make()), word)
+
+
+@pytest.mark.parametrize("reader", [*READERS, "assemble"])
+def test_single_precision_that_nobody_asked_for_is_named(reader):
+    calls = READERS | {"assemble": lambda mechanism, state: lx.assemble(mechanism)}
+    with jax.enable_x64(False):
+        refused(lambda: calls[reader](MECHANISM, STATE), "jax_enable_x64")
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -390,3 +400,88 @@ def test_a_bad_member_is_marked_and_harms_no_other(order):
             assert finite or not successful[member], (name, value)
             impossible = (name == "mass" and value < 0.0) or (name != "start" and not np.isfinite(value))
             assert not (impossible and successful[member]), (name, value)
+
+
+# Numbers of a mechanism that a run does not need to be finite, or that it would run with all the same.
+POSSIBLE = {
+    "mass": 1.0, "length": 1.0, "moment": 1.0, "turn": 1.0, "unused": 1.0, "torque": 0.1, "scale": 1.0, "rest": 0.5,
+    "slack": 1.0,
+}  # fmt: skip
+IMPOSSIBLE = {
+    "mass": -0.1, "length": -1.0, "moment": 5.0, "turn": 2.0, "unused": np.inf, "torque": -1.0, "scale": -0.5,
+    "rest": -1.0, "slack": -3.0,
+}  # fmt: skip
+
+
+def _of_numbers(mass, length, moment, turn, unused, torque, scale, rest, slack):
+    """A pendulum of two bodies, with a rope that stays slack."""
+    link = lx.RigidBody("link", mass, inertia=jnp.diag(jnp.stack([1.0, 1.0, moment])), frames={"tip": 3 * [unused]})
+    bar = lx.rod("bar", length, 1.0)
+    joints = [
+        lx.Revolute("pin", lx.GROUND, link.at([-0.5, 0.0, 0.0], turn * jnp.eye(3)), "z"),
+        lx.Fixed("weld", link, bar.at("base")),
+    ]
+    forces = [
+        lx.Gravity([0.0, -9.81, 0.0]),
+        lx.JointFriction("pin", torque, scale),
+        lx.Spring(lx.GROUND.at([0.0, 2.0, 0.0]), link, 1.0, rest),
+        lx.ElasticRope([lx.GROUND, link], slack, 9.0),
+    ]
+    return lx.Mechanism([link, bar], joints, forces)
+
+
+@jax.jit
+@jax.vmap
+def _readings(numbers):
+    """Of each member: states, whether its run and its state are right, what else was found, all of it finite or not."""
+    mechanism, ts = _of_numbers(**numbers), jnp.linspace(0.0, 0.1, TIMES)
+    assembled = lx.assemble(mechanism, {"pin": 0.3}, {"pin": 0.1})
+    run = lx.simulate(
+        mechanism, assembled, t1=0.1, saveat=diffrax.SaveAt(ts=ts), solver=diffrax.Bosh3(), accuracy=lx.DRAFT
+    )
+    state = lx.State(jnp.full(1, 0.3), jnp.zeros(1))
+    results = [run.result, lx.Solution.of_state(mechanism, state).result]
+    found = [
+        assembled.v,
+        lx.mobility(mechanism, state).distance,
+        lx.equilibrium(mechanism, state).q,
+        lx.linearise(mechanism, state, degrees_of_freedom=1).natural_frequencies,
+        lx.inverse_dynamics(mechanism, state, {"pin": 1.0}).acceleration,
+    ]
+    of = lambda kind: jnp.stack([result == kind for result in results])
+    finite = jnp.stack([jnp.all(jnp.isfinite(part)) for part in found])
+    return run.q, run.v, *found, of(lx.RESULTS.successful), of(lx.RESULTS.not_finite), finite
+
+
+def test_a_member_with_numbers_that_cannot_be_is_marked_and_changes_no_other():
+    count = len(POSSIBLE) + 2
+    right = {name: np.full(count, value) for name, value in POSSIBLE.items()}
+    wrong = {
+        name: np.where(np.arange(count) == place, IMPOSSIBLE[name], right[name]) for place, name in enumerate(right)
+    }
+    *numbers, successful, _, finite = map(np.asarray, _readings(right))
+    assert np.all(successful)
+    assert np.all(finite)
+    *found, successful, not_finite, finite = map(np.asarray, _readings(wrong))
+    spoilt = np.arange(count) < len(POSSIBLE)
+    for told in (not_finite, ~successful, ~finite):
+        np.testing.assert_array_equal(told, np.broadcast_to(spoilt[:, None], told.shape))
+    for whole, expected in zip(found, numbers, strict=True):
+        np.testing.assert_array_equal(whole[~spoilt], expected[~spoilt])
+
+
+class Wall(lx.AbstractForce):
+    limit: jax.Array
+
+    def load(self, t, motion):
+        return lx.Load.none(motion.system)
+
+
+def test_numbers_of_a_users_own_may_be_what_they_are():
+    first = lambda rows, t, motion: rows[0]
+    made = {
+        "a force": lambda limit: Wall(limit),
+        "a function": lambda limit: lx.JointTorque("pin", jax.tree_util.Partial(first, jnp.stack([1.0, limit]))),
+    }
+    for force in made.values():
+        assert jax.jit(lambda limit, force=force: sound_numbers(_pendulum(lambda link: force(limit))))(jnp.nan)

@@ -18,7 +18,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.accuracy import BALANCED
 from linkax.simulation.diagnosis import massless_bodies
-from linkax.simulation.given import by_joint, checked_state, checked_time
+from linkax.simulation.given import by_joint, checked_state, checked_time, marked
 from linkax.simulation.state import State
 from linkax.tracing import runs_once
 
@@ -68,7 +68,7 @@ def inverse_dynamics(mechanism: Mechanism, state: State, accelerations, *, t=0.0
                     f"the acceleration asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not allow "
                     "it together with the others, so ask for fewer"
                 )
-    return InverseDynamics(dict(zip(accelerations, forces, strict=True)), acceleration)
+    return marked(mechanism, InverseDynamics(dict(zip(accelerations, forces, strict=True)), acceleration))
 
 
 @runs_once

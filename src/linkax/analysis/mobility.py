@@ -11,7 +11,7 @@ from linkax.linalg.constrained_solve import least_multipliers, singularity_dista
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import Topology
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.given import check_accuracy, checked_state, checked_time
+from linkax.simulation.given import check_accuracy, checked_state, checked_time, marked
 from linkax.simulation.state import State
 from linkax.tracing import runs_once
 
@@ -28,7 +28,7 @@ class Mobility(eqx.Module):
       for each constraint that is lost in a singular configuration.
     - `num_redundant`: constraints that depend on others, those that no motion changes included.
     - `distance`: from the nearest singular configuration, see `linkax.Accuracy`. Exactly in one the
-      smaller `rank` tells, and not this.
+      smaller `rank` tells, and not this. NaN where a number that JAX traces is outside of what it can be.
     - `dispensable`: of each constraint row, in the order of `rows`, whether it could be left out
       without freeing anything.
     """
@@ -76,7 +76,8 @@ def mobility(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = 
     **Arguments:** `t`: time [s]; `accuracy`: whose rank tolerance decides.
     """
     check_accuracy(accuracy)
-    return _mobility(mechanism, checked_state(mechanism, state), jnp.asarray(checked_time(t, "t")), accuracy)
+    state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
+    return marked(mechanism, _mobility(mechanism, state, t, accuracy))
 
 
 @runs_once

@@ -24,7 +24,7 @@ from linkax.model.numbers import known, whole_number
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.assembly import CLOSED, LONGEST_STEP
 from linkax.simulation.diagnosis import massless_bodies
-from linkax.simulation.given import checked_state, checked_time
+from linkax.simulation.given import checked_state, checked_time, marked
 from linkax.simulation.state import State
 from linkax.tracing import all_known, one_by_one, pushed_forward, runs_once
 
@@ -141,7 +141,8 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
     found, remaining, gap = _equilibrium(mechanism, state, t)
     if not all_known((found, remaining, gap)):
-        return State(jnp.where((remaining <= BALANCED_STEP) & (gap <= CLOSED), found.q, jnp.nan), found.v)
+        at_rest = State(jnp.where((remaining <= BALANCED_STEP) & (gap <= CLOSED), found.q, jnp.nan), found.v)
+        return marked(mechanism, at_rest)
     if not gap <= CLOSED:
         raise EquilibriumError(
             f"the loops stay open by {float(gap):.3g}, in radians or lengths of the mechanism; start from a state made "
@@ -278,7 +279,7 @@ def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: 
         massless = massless_bodies(system, BALANCED.method(system.dtype), t, state.q)
         why = f"bodies {', '.join(map(repr, massless))} move without mass" if massless else "forces are not finite"
         raise ValueError(f"frequencies are not finite, because {why}; give mass and inertia, or finite numbers")
-    return found
+    return marked(mechanism, found)
 
 
 @runs_once

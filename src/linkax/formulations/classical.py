@@ -15,20 +15,13 @@ from linkax.equations.loops import gamma, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
-from linkax.model.numbers import known, number, whole_number
+from linkax.model.numbers import whole_number, zero_or_more
 from linkax.tracing import one_by_one, traced_once
 
 
 def parameter(default: float, what: str):
     """A field for a traced number of a method, zero or more; `what` names it in errors."""
-    return eqx.field(default=default, converter=partial(_not_negative, what))
-
-
-def _not_negative(what, entry):
-    array = number(entry, (), what)
-    if known(array) is not None and known(array) < 0.0:
-        raise ValueError(f"{what} is {entry!r}; it must be zero or more")
-    return array
+    return eqx.field(default=default, converter=partial(zero_or_more, what=what))
 
 
 class AbstractAcceleration(eqx.Module):

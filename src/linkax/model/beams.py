@@ -20,12 +20,24 @@ from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce, Load
 from linkax.model.joints.bending import MASS_PLACES, NUM_STRAINS, BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.joint import AbstractJoint
-from linkax.model.numbers import flag, instance, known, number, real, require, rotation_matrix, whole_number
-from linkax.model.sections import Section, positive
+from linkax.model.numbers import (
+    flag,
+    instance,
+    known,
+    number,
+    positive,
+    real,
+    require,
+    rotation_matrix,
+    whole_number,
+    zero_or_more,
+)
+from linkax.model.sections import Section
 from linkax.model.terms import Term
 
 # What a section needs against each component of strain.
 STIFFNESSES = ("torsional_stiffness", *2 * ("bending_stiffness",), "axial_stiffness", *2 * ("shear_stiffness",))
+PLACED = 1e-9  # of an element: rounding of places at its ends
 
 
 class Place(Frame):
@@ -92,9 +104,9 @@ class Beam(AbstractBody):
                 raise ValueError(f"{what}: its section has no {STIFFNESSES[strain]}; give it, or leave that strain out")
         if torsion or shear:
             remedy = f"{what} twists or shears, which turns sections and takes some; give it, or axial_stiffness"
-            require(section.rotary_inertia, np.any, "section: rotary_inertia [kg m]", remedy)
-        seconds = f"{what}: damping [s]"
-        self.damping = require(number(damping, (), seconds), lambda x: x >= 0.0, seconds, "it must be zero or more")
+            resists = require(section.rotary_inertia, lambda x: x.any(), "section: rotary_inertia [kg m]", remedy)
+            self.section = eqx.tree_at(lambda of: of.rotary_inertia, section, resists)
+        self.damping = zero_or_more(damping, f"{what}: damping [s]")
 
     @property
     def reference(self):
@@ -116,14 +128,21 @@ class Beam(AbstractBody):
         offset = real(where, what)
         offset = offset * np.eye(3)[0] if offset.shape == () else offset
         offset = number(offset, (3,), what)
-        if element is None:
-            along = known(offset[0] / self.element_length)
-            if along is None:
-                raise ValueError(f"{what} is traced by JAX; say which element it is in: beam.at(..., element=0)")
-            element = int(np.clip(np.floor(along), 0, self.elements - 1))
-        elif element not in range(self.elements):
-            raise ValueError(f"{what}: element is {element!r}; give an integer from 0 to {self.elements - 1}")
-        return Place(self.name, offset, axes, element)
+        if element is not None:
+            whole_number(element, f"{what}: element", least=0, most=self.elements - 1)
+            return Place(self.name, self.within(offset, what, element, element + 1), axes, int(element))
+        along = known(offset[0] / self.element_length)
+        if along is None:
+            raise ValueError(f"{what} is traced by JAX; say which element it is in: beam.at(..., element=0)")
+        element = int(np.clip(np.floor(along), 0, self.elements - 1))
+        return Place(self.name, self.within(offset, what), axes, element)
+
+    def within(self, offset, what: str, first: int = 0, last: int | None = None):
+        """A place [x, y, z], checked to be between two nodes, by default the base and the tip."""
+        begin, end = (node * self.element_length for node in (first, self.elements if last is None else last))
+        slack = PLACED * self.element_length
+        inside = lambda place: ((place[0] >= begin - slack) & (place[0] <= end + slack)).all()
+        return require(offset, inside, what, f"its distance from the base must be from {begin} m to {end} m")
 
     @property
     def element_length(self) -> Float[Array, ""]:

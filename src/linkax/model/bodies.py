@@ -4,11 +4,22 @@ import abc
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import Constant, instance, known, number, require, rotation_matrix, value
+from linkax.model.numbers import (
+    Constant,
+    instance,
+    known,
+    namespace,
+    number,
+    positive,
+    require,
+    rotation_matrix,
+    value,
+    zero_or_more,
+)
 
 GROUND_NAME = "ground"
 
@@ -82,12 +93,7 @@ class RigidBody(AbstractBody):
 
     def __init__(self, name, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(0.0, 0.0, 0.0), frames=None):
         self.name = body_name(name)
-        self.mass = require(
-            number(mass, (), f"body {name!r}: mass [kg]"),
-            lambda kilograms: kilograms >= 0.0,
-            f"body {name!r}: mass [kg]",
-            "it must be zero or more",
-        )
+        self.mass = zero_or_more(mass, f"body {name!r}: mass [kg]")
         self.center_of_mass = number(center_of_mass, (3,), f"body {name!r}: center_of_mass [m]")
         self.inertia = inertia_tensor(inertia, f"body {name!r}: inertia [kg m²]")
         frames = {} if frames is None else frames
@@ -157,27 +163,26 @@ def inertia_tensor(inertia, what):
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)
     if diagonal:
         tensor = tensor * np.eye(3)
-    concrete = known(tensor)
-    if concrete is not None:
-        scale = np.max(np.abs(concrete))
-        moments = np.linalg.eigvalsh(concrete / 2 + concrete.T / 2)
-        problem = None
-        if not np.allclose(concrete, concrete.T, rtol=0.0, atol=1e-12 * scale):
-            problem = "it must be symmetric"
-        elif moments[0] < -1e-12 * scale:
-            problem = f"its principal moments {moments.tolist()} must not be negative"
-        elif moments[2] > (moments[0] + moments[1]) * (1 + 1e-9) + 1e-12 * scale:
-            problem = (
-                f"no body has it: the largest principal moment of {moments.tolist()} exceeds the sum of the "
-                "others (triangle inequality); check units, and that it is taken about the centre of mass"
-            )
-        if problem:
-            raise ValueError(f"{what} is {concrete.tolist()}; {problem}")
-    return tensor
+    tensor = require(tensor, _is_symmetric, what, "it must be symmetric")
+    moments = _principal_moments(tensor, diagonal)
+    sizes = "" if known(moments) is None else f" {moments.tolist()}"
+    remedy = (
+        f"no body has it: its principal moments{sizes} must not be negative, and the largest must not exceed the sum "
+        "of the others (triangle inequality); check units, and that it is taken about the centre of mass"
+    )
+    largest = (moments[0] + moments[1]) * (1.0 + 1e-9) + 1e-12 * abs(moments).max()
+    return require(tensor, lambda _: moments[2] <= largest, what, remedy)
 
 
-def _length(length, what):
-    return require(number(length, (), what), lambda metres: metres > 0.0, what, "it must be positive")
+def _is_symmetric(tensor):
+    return abs(tensor - tensor.T).max() <= 1e-12 * abs(tensor).max()
+
+
+def _principal_moments(tensor, diagonal):
+    """In rising order; without derivative."""
+    xp = namespace(tensor)
+    tensor = tensor if xp is np else lax.stop_gradient(tensor)
+    return xp.sort(xp.diagonal(tensor)) if diagonal else xp.linalg.eigvalsh(tensor / 2.0 + tensor.T / 2.0)
 
 
 def rod(name: str, length, mass) -> RigidBody:
@@ -185,7 +190,7 @@ def rod(name: str, length, mass) -> RigidBody:
 
     `length` [m], `mass` [kg]; mass × length² / 12 about the transverse axes, none about its own.
     """
-    length = _length(length, f"rod {name!r}: length [m]")
+    length = positive(length, f"rod {name!r}: length [m]")
     mass = number(mass, (), f"body {name!r}: mass [kg]")
     along = np.array([1.0, 0.0, 0.0])
     return RigidBody(
@@ -205,8 +210,7 @@ def point_mass(name: str, mass) -> RigidBody:
 def box(name: str, size, mass) -> RigidBody:
     """A uniform box with its centre as reference; `size` is its extent along x, y, z [m]."""
     what = f"box {name!r}: size [m]"
-    size = require(number(size, (3,), what), lambda metres: np.all(metres > 0.0), what, "all must be positive")
+    size = require(number(size, (3,), what), lambda metres: (metres > 0.0).all(), what, "all must be positive")
     mass = number(mass, (), f"body {name!r}: mass [kg]")
     squares = size * size
-    xp = np if isinstance(squares, np.ndarray) else jnp
-    return RigidBody(name, mass, inertia=mass / 12 * (xp.sum(squares) - squares))
+    return RigidBody(name, mass, inertia=mass / 12 * (squares.sum() - squares))

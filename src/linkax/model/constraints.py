@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from linkax.model.elements import AbstractElement
 from linkax.model.functions import Law
-from linkax.model.numbers import known, number
+from linkax.model.numbers import number, require
 from linkax.model.terms import Term, term
 
 
@@ -32,9 +32,9 @@ class AbstractConstraint(AbstractElement):
     def right_side(self, t) -> Float[Array, ""]:
         """At time t [s]."""
 
-    @abc.abstractmethod
     def held(self, t) -> "AbstractConstraint":
         """The same with the right side of time t for ever."""
+        return self
 
 
 class LinearConstraint(AbstractConstraint):
@@ -49,9 +49,6 @@ class LinearConstraint(AbstractConstraint):
     @property
     def terms(self):
         return self.related
-
-    def held(self, t):
-        return Coupling(self.name, dict(zip(self.terms, self.coefficients, strict=True)), self.right_side(t))
 
 
 class Coupling(LinearConstraint):
@@ -79,9 +76,9 @@ class Coupling(LinearConstraint):
             raise ValueError(f"coupling {name!r}: coefficients are {coefficients!r}; give {{joint: factor, ...}}")
         self.related = tuple(term(key, f"coupling {name!r}") for key in coefficients)
         what = f"coupling {name!r}: coefficients"
-        self.coefficients = number(list(coefficients.values()), (len(coefficients),), what)
-        if known(self.coefficients) is not None and not np.any(known(self.coefficients)):
-            raise ValueError(f"{what} are all zero: {coefficients!r}; give a factor that is not zero")
+        factors = number(list(coefficients.values()), (len(coefficients),), what)
+        remedy = "all are zero; give a factor that is not zero"
+        self.coefficients = require(factors, lambda x: (x != 0.0).any(), what, remedy)
         self.offset = number(offset, (), f"coupling {name!r}: offset")
 
     def right_side(self, t):
@@ -121,6 +118,9 @@ class Drive(LinearConstraint):
 
     def right_side(self, t):
         return self.motion(t)
+
+    def held(self, t):
+        return Coupling(self.name, dict(zip(self.terms, np.ones(1), strict=True)), self.right_side(t))
 
 
 def checked_name(name, what) -> str:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from linkax.model.bodies import Frame, frame_of
 from linkax.model.elements import AbstractElement
 from linkax.model.functions import Law, evaluated, number_or_law, raised
-from linkax.model.numbers import number, require
+from linkax.model.numbers import number, positive, zero_or_more
 from linkax.model.terms import Term, term
 from linkax.spatial.vectors import dot
 
@@ -205,10 +205,8 @@ class JointFriction(_AlongJoint):
     def __init__(self, joint, torque, scale):
         self.joint = term(joint, "JointFriction")
         what = f"JointFriction on {self.joint.joint!r}"
-        torque_of = f"{what}: torque [N m or N]"
-        self.torque = require(number(torque, (), torque_of), lambda x: x >= 0.0, torque_of, "it must be zero or more")
-        scale_of = f"{what}: scale [rad/s or m/s]"
-        self.scale = require(number(scale, (), scale_of), lambda x: x > 0.0, scale_of, "it must be positive")
+        self.torque = zero_or_more(torque, f"{what}: torque [N m or N]")
+        self.scale = positive(scale, f"{what}: scale [rad/s or m/s]")
 
     def torque_at(self, t, motion):
         return -self.torque * jnp.tanh(motion.joint_rate(self.joint) / self.scale)
@@ -254,9 +252,7 @@ class Spring(_BetweenPoints):
     def __init__(self, first, second, stiffness, free_length=0.0):
         self.first, self.second = _frames("Spring", first, second)
         self.stiffness = number(stiffness, (), f"{self.described}: stiffness [N/m]")
-        what = f"{self.described}: free_length [m]"
-        length = number(free_length, (), what)
-        self.free_length = require(length, lambda metres: metres >= 0.0, what, "it must be zero or more")
+        self.free_length = zero_or_more(free_length, f"{self.described}: free_length [m]")
 
     def pull(self, motion):
         along = motion.configuration.between(self.first, self.second)

@@ -13,7 +13,7 @@ from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
-from linkax.model.numbers import instance
+from linkax.model.numbers import flag, instance
 from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
 
 
@@ -92,7 +92,7 @@ class Mechanism(eqx.Module):
             child=tuple(index[joint.child.body] for joint in self.joints),
             joint_types=tuple(joint.kind for joint in self.joints),
             movers=tuple(joint.movers for joint in self.joints),
-            **split_rows(carriers, predecessors, cuts, all_rows),
+            **split_rows(carriers, predecessors, cuts, flag(all_rows, "all_rows")),
             constraints=tuple(constraint.name for constraint in constraints),
             constraint_terms=tuple(constraint.terms for constraint in constraints),
             constraint_bodies=tuple(tuple(index[f.body] for f in constraint.frames) for constraint in constraints),

@@ -1,15 +1,17 @@
 """Numbers of a model: which are traced, which are structure, and how they are checked.
 
 Values that are known when a model is built are validated there. Values under a JAX
-transformation are not known; they are passed on, and a bad one shows in the solution's result.
+transformation are not known: one that cannot be becomes NaN (`require`), so that the solution's result tells.
 """
 
 import numbers
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from linkax.spatial.rotations import COORDINATE_AXES
 
@@ -41,13 +43,23 @@ def known(number) -> np.ndarray | None:
     return None if isinstance(number, jax.core.Tracer) else np.asarray(number)
 
 
+def namespace(*arrays):
+    """NumPy for arrays whose values are known, or jax.numpy where one is traced."""
+    return np if all(known(array) is not None for array in arrays) else jnp
+
+
 def number(entry, shape: tuple[int, ...], what: str):
     """A traced leaf of the given shape in double precision; `what` names it in errors."""
     array = real(entry, what)
     if array.shape != shape:
         expected = "a single number" if shape == () else f"an array of shape {shape}"
         raise ValueError(f"{what} has shape {array.shape}; it must be {expected}")
-    return require(array, lambda concrete: np.all(np.isfinite(concrete)), what, "it must be finite")
+    return require(array, is_finite, what, "it must be finite")
+
+
+def is_finite(array):
+    """Whether all numbers of an array are."""
+    return namespace(array).isfinite(array).all()
 
 
 def real(entry, what: str):
@@ -72,20 +84,27 @@ def converted(entry, what: str, convert):
             raise TypeError("no real number")
         return convert(entry)
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{what} is {entry!r}; it must be a number or an array of numbers, real ones") from error
+        raise ValueError(
+            f"{what} is {entry!r}; it must be a number or an array of numbers, real ones, none masked"
+        ) from error
 
 
 def _is_real(part) -> bool:
+    if np.ma.is_masked(part):
+        return False
     if getattr(part, "dtype", np.dtype(object)) == np.dtype(object):
         entries = np.ravel(part).tolist()
         return all(isinstance(entry, numbers.Real) and not isinstance(entry, bool) for entry in entries)
     return jnp.issubdtype(part.dtype, jnp.floating) or jnp.issubdtype(part.dtype, jnp.integer)
 
 
-def whole_number(entry, what: str, least: int = 1) -> int:
-    """An integer of at least `least`."""
-    if isinstance(entry, bool) or not isinstance(entry, int | np.integer) or entry < least:
-        raise ValueError(f"{what} is {entry!r}; it must be an integer of at least {least}")
+MOST = 2**31 - 1  # that counts may be
+
+
+def whole_number(entry, what: str, least: int = 1, most: int = MOST) -> int:
+    """An integer from `least` to `most`."""
+    if isinstance(entry, bool) or not isinstance(entry, int | np.integer) or not least <= entry <= most:
+        raise ValueError(f"{what} is {entry!r}; it must be an integer of at least {least} and at most {most}")
     return int(entry)
 
 
@@ -104,11 +123,28 @@ def instance(entry, kind, what: str, remedy: str):
 
 
 def require(array, condition, what: str, remedy: str):
-    """Raise a ValueError where `condition` fails on an array whose values are known."""
+    """An array that meets a condition.
+
+    Where the condition is known, it raises a ValueError if it fails; where it is traced, an array that fails it is
+    NaN, which the result of a simulation tells.
+    """
     concrete = known(array)
-    if concrete is not None and not condition(concrete):
+    met = condition(lax.stop_gradient(array) if concrete is None else concrete)
+    if known(met) is None:
+        return jnp.where(met, array, jnp.nan)
+    if not met:
         raise ValueError(f"{what} is {concrete.tolist()}; {remedy}")
     return array
+
+
+def positive(entry, what: str, remedy: str = "it must be positive"):
+    """A positive number."""
+    return require(number(entry, (), what), lambda x: x > 0.0, what, remedy)
+
+
+def zero_or_more(entry, what: str):
+    """A number that is not negative."""
+    return require(number(entry, (), what), lambda x: x >= 0.0, what, "it must be zero or more")
 
 
 def unit_axis(axis, what: str):
@@ -118,36 +154,43 @@ def unit_axis(axis, what: str):
             known_axes = ", ".join(COORDINATE_AXES)
             raise ValueError(f"{what} is {axis!r}; known names are {known_axes}, or give a vector")
         return Constant(COORDINATE_AXES[axis])
-    vector = number(axis, (3,), what)
+    remedy = "its length is zero or infinite; give a nonzero vector of finite length"
+    vector = require(number(axis, (3,), what), lambda entries: _is_length(_norm(entries)), what, remedy)
+    unit = vector / _norm(vector)
+    return Constant(unit) if isinstance(vector, np.ndarray) else unit
+
+
+def _norm(vector):
     with np.errstate(over="ignore", under="ignore"):
-        length = np.linalg.norm(vector) if isinstance(vector, np.ndarray) else jnp.linalg.norm(vector)
-    if known(length) is not None and not 0.0 < known(length) < np.inf:
-        size = "zero" if length == 0.0 else "infinite"
-        raise ValueError(f"{what} has {size} length: {known(vector).tolist()}; give a nonzero vector of finite length")
-    return Constant(vector / length) if isinstance(vector, np.ndarray) else vector / length
+        return np.linalg.norm(vector) if isinstance(vector, np.ndarray) else jnp.linalg.norm(vector)
 
 
-def perpendicular_axis(axis, first, what: str):
-    """A unit vector like `unit_axis`, checked to be at a right angle to another."""
+def _is_length(length):
+    return (length > 0.0) & (length < np.inf)
+
+
+def perpendicular_axes(first, axis, what: str):
+    """Two unit vectors, the first as `unit_axis` made it, the second from `axis` and checked to be at a right angle."""
     second = unit_axis(axis, what)
-    one, other = known(value(first)), known(value(second))
-    if one is not None and other is not None and abs(cosine := float(one @ other)) > 1e-12:
-        raise ValueError(
-            f"{what} is {other.tolist()}, at {np.degrees(np.arccos(cosine)):.6g} degrees to the first axis "
-            f"{one.tolist()}; it must be at a right angle to it"
-        )
-    return second
+    one, other = value(first), value(second)
+    cosine = known(one @ other)
+    angle = "" if cosine is None else f", at {np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))):.6g} degrees"
+    remedy = f"it must be at a right angle to the first axis{angle}"
+    checked = partial(require, condition=lambda _: abs(one @ other) <= 1e-12, what=what, remedy=remedy)
+    checked(other)
+    mark = lambda unit: unit if isinstance(unit, Constant) else checked(unit)
+    return mark(first), mark(second)
 
 
 def rotation_matrix(rotation, what: str):
     """A rotation: None (identity) and numbers are structure, a JAX array is traced."""
     if rotation is None:
         return Constant(np.eye(3))
-    matrix = number(rotation, (3, 3), what)
-    require(
-        matrix,
-        lambda entries: np.allclose(entries @ entries.T, np.eye(3), atol=1e-9) and np.linalg.det(entries) > 0,
-        what,
-        "its columns must be the orthonormal, right-handed axes of the frame",
-    )
+    remedy = "its columns must be the orthonormal, right-handed axes of the frame"
+    matrix = require(number(rotation, (3, 3), what), _is_rotation, what, remedy)
     return Constant(matrix) if isinstance(matrix, np.ndarray) else matrix
+
+
+def _is_rotation(matrix):
+    xp = namespace(matrix)
+    return xp.allclose(matrix @ matrix.T, np.eye(3), atol=1e-9) & (xp.linalg.det(matrix) > 0.0)

@@ -10,8 +10,7 @@ from linkax.model.bodies import Frame, frame_of
 from linkax.model.constraints import AbstractConstraint, checked_name
 from linkax.model.forces import AbstractForce, Load
 from linkax.model.functions import Law, evaluated
-from linkax.model.numbers import number, require
-from linkax.model.sections import positive
+from linkax.model.numbers import positive, zero_or_more
 from linkax.spatial.vectors import dot, length
 
 Points = tuple[Frame, ...]
@@ -92,7 +91,7 @@ class Rope(AbstractConstraint):
         return -evaluated(self.length, t)
 
     def held(self, t):
-        return Rope(self.name, self.points, evaluated(self.length, t))
+        return Rope(self.name, self.points, evaluated(self.length, t)) if self.is_driven else self
 
     def value(self, configuration):
         """Minus its length: rows are such that their multipliers are tensions."""
@@ -129,8 +128,7 @@ class ElasticRope(AbstractForce):
         self.points = _points(points, "ElasticRope")
         self.stiffness = positive(stiffness, f"{self.described}: stiffness [N/m]")
         self.free_length = positive(free_length, f"{self.described}: free_length [m]")
-        what = f"{self.described}: damping [N s/m]"
-        self.damping = require(number(damping, (), what), lambda x: x >= 0.0, what, "it must be zero or more")
+        self.damping = zero_or_more(damping, f"{self.described}: damping [N s/m]")
 
     @property
     def frames(self):

@@ -7,12 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import known, number, require
-
-
-def positive(entry, what):
-    """A positive number."""
-    return require(number(entry, (), what), lambda x: x > 0.0, what, "it must be positive")
+from linkax.model.numbers import known, namespace, number, positive, require
 
 
 class Material(eqx.Module):
@@ -31,7 +26,7 @@ class Material(eqx.Module):
         self.youngs_modulus = positive(youngs_modulus, "material: youngs_modulus [Pa]")
         what = "material: poissons_ratio"
         ratio = number(poissons_ratio, (), what)
-        self.poissons_ratio = require(ratio, lambda x: -1.0 < x <= 0.5, what, "it must be in (-1, 0.5]")
+        self.poissons_ratio = require(ratio, lambda x: (x > -1.0) & (x <= 0.5), what, "it must be in (-1, 0.5]")
         self.density = positive(density, "material: density [kg/m³]")
 
     @property
@@ -83,7 +78,7 @@ class Section(eqx.Module):
         if rotary_inertia is not None:
             what = "section: rotary_inertia [kg m]"
             pair = _pair(rotary_inertia, what)
-            self.rotary_inertia = require(pair, lambda x: np.all(x >= 0.0), what, "it must be zero or more")
+            self.rotary_inertia = require(pair, lambda x: (x >= 0.0).all(), what, "it must be zero or more")
         elif self.axial_stiffness is not None:
             self.rotary_inertia = self.linear_density * self.bending_stiffness / self.axial_stiffness
         else:
@@ -109,7 +104,7 @@ def _pair(entry, what):
 
 
 def _both(entry, what):
-    return require(_pair(entry, what), lambda x: np.all(x > 0.0), what, "it must be positive")
+    return require(_pair(entry, what), lambda x: (x > 0.0).all(), what, "it must be positive")
 
 
 def _of_profile(material, area, second_moments, torsion_constant, shear_coefficients) -> Section:
@@ -127,10 +122,11 @@ def _of_profile(material, area, second_moments, torsion_constant, shear_coeffici
 
 
 def _wall(thickness, sizes, what):
-    """The thickness of walls that fit into a profile of these sizes, where they are known."""
-    most = min((float(known(size)) for size in sizes if known(size) is not None), default=np.inf) / 2.0
-    remedy = f"it must be positive, and less than half of the profile, {most}"
-    return require(number(thickness, (), what), lambda metres: 0.0 < metres < most, what, remedy)
+    """The thickness of walls that fit into a profile of these sizes."""
+    most = namespace(*sizes).stack(sizes).min() / 2.0
+    known_most = "" if known(most) is None else f", {float(most)}"
+    remedy = f"it must be positive, and less than half of the profile{known_most}"
+    return require(number(thickness, (), what), lambda metres: (metres > 0.0) & (metres < most), what, remedy)
 
 
 def rectangle(width, height, material: Material, thickness=None) -> Section:

@@ -32,7 +32,7 @@ class Accuracy(eqx.Module):
       lengths of the mechanism.
     - `metric`: "mass" (default) or "identity", see `linkax.TangentSpace`.
 
-    **Raises:** `ValueError` for a tolerance that is not a positive, finite number.
+    **Raises:** `ValueError` for a tolerance that is not a positive number of at most 1.
     """
 
     rtol: np.ndarray
@@ -63,9 +63,8 @@ class Accuracy(eqx.Module):
 
 def _number(name, value, zero=False):
     kind = "zero or more" if zero else "positive"
-    return require(
-        number(value, (), name), lambda x: x > 0.0 or (zero and x == 0.0), name, f"it must be {kind}, such as 1e-8"
-    )
+    right = lambda x: ((x > 0.0) | (zero & (x == 0.0))) & (x <= 1.0)
+    return require(number(value, (), name), right, name, f"it must be {kind}, and at most 1, such as 1e-8")
 
 
 def _one_of(name, value, choices):

@@ -16,7 +16,7 @@ from linkax.linalg.constrained_solve import constrained_solve, invert
 from linkax.model.mechanism import Mechanism
 from linkax.model.terms import Term
 from linkax.simulation.accuracy import BALANCED
-from linkax.simulation.given import Given, by_joint, check_mechanism, checked_time, coordinates_by_joint
+from linkax.simulation.given import Given, by_joint, check_mechanism, checked_time, coordinates_by_joint, sound_numbers
 from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
@@ -78,7 +78,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
     state, remainder = _assemble(mechanism, positions, speeds, guess, t)
     if not all_known((state, remainder)):
-        return State(state.q, jnp.where(remainder.is_met(), state.v, jnp.inf))
+        return State(state.q, jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf))
     _raise_if_open(mechanism, state, t, jax.tree.map(np.asarray, remainder))
     return state
 

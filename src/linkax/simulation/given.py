@@ -1,17 +1,23 @@
 """What users give for a mechanism, checked: numbers for joints, states, times."""
 
 from collections.abc import Mapping
+from functools import reduce
+from itertools import chain
+from operator import and_
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
+from linkax.model.functions import Law
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import instance, known, number, real, require
+from linkax.model.numbers import instance, is_finite, known, namespace, number, real, require
 from linkax.model.terms import Term, term
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.state import State
+from linkax.tracing import all_known
 
 
 class Given(eqx.Module):
@@ -31,7 +37,12 @@ class Given(eqx.Module):
 
 
 def check_mechanism(mechanism):
-    """Whether this is one mechanism."""
+    """Whether this is one mechanism, and JAX is in double precision."""
+    if not jax.config.jax_enable_x64:
+        raise ValueError(
+            "jax_enable_x64 is False, switched off after linkax was imported; switch it on again by "
+            'jax.config.update("jax_enable_x64", True), and for a run in single precision give dtype=jnp.float32'
+        )
     instance(mechanism, Mechanism, "mechanism", "give a linkax.Mechanism, such as your function of parameters returns")
     for body in mechanism.bodies:
         if np.shape(body.mass) != ():
@@ -44,6 +55,27 @@ def check_mechanism(mechanism):
         raise ValueError(
             f"mechanism cannot move, nor be computed: none of its joints {names} does; make one a joint that does"
         )
+
+
+def sound_numbers(mechanism) -> Bool[Array, ""] | np.bool_:
+    """Whether no traced number of a mechanism is one that cannot be, see `linkax.model.numbers.require`.
+
+    What a user's own elements and functions hold is not looked at.
+    """
+    places = (mechanism.bodies, mechanism.beams, mechanism.joints, mechanism.forces, mechanism.constraints)
+    own = [element for element in chain(*places) if type(element).__module__.startswith("linkax.")]
+    leaves = jax.tree.leaves(own, is_leaf=lambda node: isinstance(node, Law))
+    traced = [leaf for leaf in leaves if isinstance(leaf, jax.core.Tracer)]
+    return reduce(and_, map(is_finite, traced), np.True_)
+
+
+def marked(mechanism, found):
+    """What was found of a mechanism, with NaN for its numbers where `sound_numbers` is false."""
+    if all_known(mechanism):
+        return found
+    sound = sound_numbers(mechanism)
+    mark = lambda leaf: jnp.where(sound, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
+    return jax.tree.map(mark, found)
 
 
 def check_accuracy(accuracy):
@@ -79,17 +111,23 @@ def checked_state(mechanism, state) -> State:
             continue
         for (name, taken), kind in zip(slices.items(), topology.joint_types, strict=False):
             of_joint = f"state.{what} of joint {name!r}"
-            require(entries[taken], lambda x: np.all(np.isfinite(x)), of_joint, "it must be finite")
+            require(entries[taken], is_finite, of_joint, "it must be finite")
             if kind.has_quaternion and what == "q":
                 _check_quaternion(entries[taken], of_joint)
     return State(*found)
 
 
 def _check_quaternion(coordinates, what):
-    """Whether coordinates begin with a quaternion that is a rotation."""
+    """Coordinates that begin with a quaternion that is a rotation."""
+
+    def turns(entries):
+        size = namespace(entries).linalg.norm(entries[:4])
+        return (size > 0.0) & (size < np.inf)
+
     with np.errstate(over="ignore"):
-        turns = lambda entries: 0.0 < np.linalg.norm(entries[:4]) < np.inf
-        require(coordinates, turns, what, "its quaternion is no rotation; give one of length 1, like (1, 0, 0, 0)")
+        return require(
+            coordinates, turns, what, "its quaternion is no rotation; give one of length 1, like (1, 0, 0, 0)"
+        )
 
 
 def by_joint(mechanism: Mechanism, given, what: str, count) -> Given:
@@ -116,13 +154,14 @@ def by_joint(mechanism: Mechanism, given, what: str, count) -> Given:
 
 def coordinates_by_joint(mechanism: Mechanism, given, what: str) -> Given:
     """Coordinates of joints, quaternions whole and not zero."""
-    found = by_joint(mechanism, given, what, lambda joint: joint.num_coordinates)
+    found, values = by_joint(mechanism, given, what, lambda joint: joint.num_coordinates), []
     for along, entry in zip(found.terms, found.values, strict=True):
         joint = mechanism.joint(along.joint)
         if joint.has_quaternion and along.index is None:
-            _check_quaternion(entry, f"{what} of joint {joint.name!r}")
+            entry = _check_quaternion(entry, f"{what} of joint {joint.name!r}")
         if joint.has_quaternion and along.index in (0, 1, 2):
             raise ValueError(
                 f"{what} of joint {joint.name!r}: index {along.index} is part of a quaternion; give all of it"
             )
-    return found
+        values.append(entry)
+    return Given(found.terms, tuple(values))

@@ -46,6 +46,10 @@ class Outset(NamedTuple):
         """Motion can start from here."""
         return self.finite & self.massive & self.closed & self.on_branch & self.unique
 
+    def of_numbers(self, sound) -> "Outset":
+        """The same of a mechanism whose numbers are sound or not, which then is what is wrong."""
+        return self._replace(finite=self.finite & sound, assembled=self.assembled | jnp.logical_not(sound))
+
 
 def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     """Close a state and find the rank around it.

@@ -34,7 +34,9 @@ class RESULTS(diffrax.RESULTS):
         "rising order between them."
     )
     not_finite = (
-        "The initial state, the numbers of the mechanism, or its forces there are not finite; give finite ones."
+        "The initial state, the numbers of the mechanism, or its forces there are not finite, or a number is outside "
+        "of what it can be, such as a negative length; give finite ones. Outside of JAX transformations such a "
+        "mechanism is refused, by an error that names the number."
     )
 
 

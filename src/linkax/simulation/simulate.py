@@ -15,10 +15,10 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import formulation as named_formulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import instance, known
+from linkax.model.numbers import flag, instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.diagnosis import cause, lost_accuracy, uncertain_branch
-from linkax.simulation.given import check_accuracy, checked_state, checked_time
+from linkax.simulation.given import check_accuracy, checked_state, checked_time, sound_numbers
 from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.options import (
     check_kinds,
@@ -106,6 +106,8 @@ def simulate(
         raise ValueError(f"t1 is {t1} s, t0 is {t0} s; t1 must be larger")
     state = checked_state(mechanism, state)
     check_accuracy(accuracy)
+    flag(throw, "throw")
+    flag(optimise, "optimise")
     check_kinds(
         saveat=saveat,
         solver=solver,
@@ -131,6 +133,8 @@ def simulate(
     mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
     # Compiled apart, so that another solver, formulation or saveat compiles no more than it must.
     outset = _start(mechanism, state, t0, accuracy)
+    if not all_known(mechanism):
+        outset = outset.of_numbers(sound_numbers(mechanism))
     found, formulation = _integrate(
         mechanism,
         accuracy,

@@ -17,14 +17,14 @@ from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known, number, require
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.given import check_accuracy, checked_state, checked_time
+from linkax.simulation.given import check_accuracy, checked_state, checked_time, sound_numbers
 from linkax.simulation.instant import Instant, Pose, Power, Violation
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
 from linkax.simulation.rows import over_rows
 from linkax.simulation.state import State
-from linkax.tracing import compiled
+from linkax.tracing import all_known, compiled
 
 FEW = 100_000  # times of all members: reading more, or beams, takes longer than compiling
 
@@ -71,6 +71,9 @@ class Solution(eqx.Module):
         state = checked_state(mechanism, state)
         check_accuracy(accuracy)
         t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
+        result = RESULTS.successful
+        if not all_known(mechanism):
+            result = RESULTS.where(sound_numbers(mechanism), result, RESULTS.not_finite)
         return Solution(
             mechanism=mechanism,
             accuracy=accuracy,
@@ -82,7 +85,7 @@ class Solution(eqx.Module):
             t_end=t,
             end=state,
             stats={},
-            result=RESULTS.successful,
+            result=result,
             rank_nearby=None,
             closest=jnp.ones((), state.q.dtype),
             interpolation=None,
@@ -234,7 +237,8 @@ class Solution(eqx.Module):
                 "error_estimate needs the solution of a run that saved states: from linkax.simulate, "
                 "without SaveAt(fn=...)"
             )
-        require(number(factor, (), "factor"), lambda x: 0.0 < x < 1.0, "factor", "it must lie between 0 and 1")
+        between = lambda x: (x > 0.0) & (x < 1.0)
+        factor = require(number(factor, (), "factor"), between, "factor", "it must lie between 0 and 1")
         return _difference(self, (lambda solution: solution.q) if reading is None else reading, factor)
 
     def passages(self) -> Passages:
@@ -252,7 +256,8 @@ class Solution(eqx.Module):
             raise ValueError("evaluate needs a dense solution; simulate with saveat=diffrax.SaveAt(dense=True)")
         t, first, last = number(t, (), "t [s]"), known(self.interpolation.t0), known(self.t_end)
         if first is not None and last is not None and first.shape == ():
-            require(t, lambda t: first <= t <= last, "t [s]", f"give a time of the run, from {first} s to {last} s")
+            during = lambda t: (t >= first) & (t <= last)
+            t = require(t, during, "t [s]", f"give a time of the run, from {first} s to {last} s")
         return _evaluate(dataclasses.replace(self, repeat=None), t)
 
     def _of_constraint(self, function, name):
@@ -294,7 +299,9 @@ class Solution(eqx.Module):
         what = f"point on body {body!r} [m]"
         if isinstance(found, Beam) and np.ndim(at) == 0:
             at = number(at, (), what) * np.eye(3)[0]
-        offset = jnp.broadcast_to(number(at, (3,), what), (*self.ts.shape[:-1], 3))
+        offset = number(at, (3,), what)
+        offset = found.within(offset, what) if isinstance(found, Beam) else offset
+        offset = jnp.broadcast_to(offset, (*self.ts.shape[:-1], 3))
         if isinstance(found, Beam):
             return read(Instant.on_beam, self, function, found, offset)
         return read(function, self, self._index(body), offset)

@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import real, require
+from linkax.model.numbers import is_finite, real, require
 from linkax.studies.parameters import AbstractParameter
 from linkax.studies.showing import path_parts
 
@@ -99,7 +99,7 @@ def _check(path, leaf):
         return
     name = _names(path, ())[0]
     what = f"parameter {name!r}"
-    require(real(leaf, what), lambda x: np.all(np.isfinite(x)), what, "it must be finite")
+    require(real(leaf, what), is_finite, what, "it must be finite")
 
 
 def _names(path, shape) -> list[str]:

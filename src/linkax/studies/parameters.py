@@ -6,11 +6,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from linkax.model.bodies import inertia_tensor
-from linkax.model.numbers import number, real, require
+from linkax.model.numbers import is_finite, namespace, number, real, require
 
 
 class AbstractParameter(eqx.Module):
@@ -51,7 +51,7 @@ class Bounded(AbstractParameter):
 
     def __init__(self, value, lower, upper):
         self.lower, self.upper = (number(bound, (), "Bounded: bound") for bound in (lower, upper))
-        inside = lambda value: (value > float(lower)) & (value < float(upper))
+        inside = lambda value: (value > self.lower) & (value < self.upper)
         self.value = _checked("Bounded", value, inside, f"must lie between {lower} and {upper}")
 
     @property
@@ -84,18 +84,16 @@ class PhysicalInertia(AbstractParameter):
     value: Inertia
 
     def __init__(self, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(1.0, 1.0, 1.0)):
-        self.value = Inertia(
-            number(mass, (), "PhysicalInertia: mass [kg]"),
-            number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]"),
-            inertia_tensor(inertia, "PhysicalInertia: inertia [kg m²]"),
+        mass = number(mass, (), "PhysicalInertia: mass [kg]")
+        center_of_mass = number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]")
+        inertia = inertia_tensor(inertia, "PhysicalInertia: inertia [kg m²]")
+        smallest = _least(_pseudo_inertia(mass, center_of_mass, inertia))
+        remedy = (
+            f"no body with extent along all axes has it and inertia {inertia} kg m²; all principal moments must be "
+            "positive, and each smaller than the sum of the other two"
         )
-        smallest = np.min(np.linalg.eigvalsh(_pseudo_inertia(*self.value)))
-        if not smallest > 0.0:
-            raise ValueError(
-                f"PhysicalInertia: no body with extent along all axes has mass {mass} kg and inertia "
-                f"{np.asarray(inertia).tolist()} kg m²; all principal moments must be positive, and each smaller than "
-                "the sum of the other two"
-            )
+        mass = require(mass, lambda _: smallest > 0.0, "PhysicalInertia: mass [kg]", remedy)
+        self.value = Inertia(mass, center_of_mass, inertia)
 
     @property
     def free(self):
@@ -125,10 +123,15 @@ def _pseudo_inertia(mass, center, inertia):
     return jnp.block([[second, first], [first.T, jnp.reshape(mass, (1, 1))]])
 
 
+def _least(matrix):
+    """The smallest eigenvalue, without derivative."""
+    return namespace(matrix).linalg.eigvalsh(lax.stop_gradient(matrix)).min()
+
+
 def _checked(kind, value, condition, remedy):
     array = jnp.asarray(real(value, f"{kind}: value"))
-    finite = lambda value: np.all(np.isfinite(value) & condition(value))
-    return require(array, finite, f"{kind}: value", f"it {remedy}, and be finite")
+    right = lambda value: is_finite(value) & condition(value).all()
+    return require(array, right, f"{kind}: value", f"it {remedy}, and be finite")
 
 
 def as_arrays(tree, what):

@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import instance, real, require
+from linkax.model.numbers import instance, is_finite, namespace, real, require
 from linkax.studies.parameters import as_arrays
 
 
@@ -55,8 +54,8 @@ def shoot(run: Callable, starts: Any, ts: Float[Array, " n_t"]) -> Shots:
         raise ValueError(
             f"{count} starts for times of shape {ts.shape}; give as many times for each motion, such as {count * 10}"
         )
-    in_order = lambda ts: np.all(np.isfinite(ts)) and np.all(np.diff(ts) > 0.0)
-    require(ts, in_order, "times [s]", "give finite times in rising order")
+    in_order = lambda ts: is_finite(ts) & (namespace(ts).diff(ts) > 0.0).all()
+    ts = require(ts, in_order, "times [s]", "give finite times in rising order")
     parts = ts.reshape(count, -1)
     until = jnp.append(parts[1:, 0], 2.0 * ts[-1] - ts[-2])
     ends, outputs = jax.vmap(run)(starts, parts, until)

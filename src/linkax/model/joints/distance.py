@@ -2,7 +2,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from linkax.model.joints.joint import AbstractJoint, unturned
-from linkax.model.numbers import number, require
+from linkax.model.numbers import positive
 
 
 class Distance(AbstractJoint):
@@ -33,9 +33,8 @@ class Distance(AbstractJoint):
 
     def __init__(self, name: str, parent, child, length):
         super().__init__(name, parent, child, "x")
-        what = f"distance {name!r}: length [m]"
         remedy = "it must be positive; to join two points, use lx.Spherical"
-        self.length = require(number(length, (), what), lambda metres: metres > 0.0, what, remedy)
+        self.length = positive(length, f"distance {name!r}: length [m]", remedy)
 
     @property
     def number(self):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from linkax.model.bodies import Frame, frame_of
-from linkax.model.numbers import Constant, flag, perpendicular_axis, unit_axis, value
+from linkax.model.numbers import Constant, flag, perpendicular_axes, unit_axis, value
 from linkax.model.terms import Term
 from linkax.spatial.rotations import frame_about_axis, rotation_about_first_axis
 
@@ -112,7 +112,8 @@ class AbstractJoint(eqx.Module):
         self.axis = unit_axis(axis, f"joint {name!r}: axis")
         self.second_axis = second_axis
         if second_axis is not None:
-            self.second_axis = perpendicular_axis(second_axis, self.axis, f"joint {name!r}: second_axis")
+            what = f"joint {name!r}: second_axis"
+            self.axis, self.second_axis = perpendicular_axes(self.axis, second_axis, what)
         self.cut = flag(cut, f"joint {name!r}: cut")
 
     @property
