@@ -45,19 +45,21 @@ def refused(call, *words):
     try:
         found = call()
     except Exception as caught:
-        return _clear(caught, words)
+        return clear(caught, words)
     raise AssertionError(f"accepted; it returned {found!r}")
 
 
-def _clear(error, words):
-    told = f"{type(error).__name__}: {error}\n{''.join(traceback.format_tb(error.__traceback__))}"
-    assert type(error) in DOCUMENTED, f"no error of linkax's own\n{told}"
-    last = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
-    assert SOURCE in last.parents, f"not raised by linkax\n{told}"
+def clear(error, words):
+    """Check that an error is a clear one with all `words`, and return it."""
+    told = lambda: f"{type(error).__name__}: {error}\n{''.join(traceback.format_tb(error.__traceback__))}"
+    assert type(error) in DOCUMENTED, f"no error of linkax's own\n{told()}"
+    last = traceback.extract_tb(error.__traceback__, limit=-1)[-1]
+    assert SOURCE in Path(last.filename).parents, f"not raised by linkax\n{told()}"
+    assert "raise" in last.line, f"not raised on purpose\n{told()}"
     message = str(error)
     for word in words:
         named = message in word if isinstance(word, Shown) else word in message
-        assert named, f"{word!r} is not named\n{told}"
-    assert REMEDY.search(message), f"no remedy\n{told}"
-    assert len(re.split(r"[;:,.] ", message)) > 1, f"no more than one clause\n{told}"
+        assert named, f"{word!r} is not named\n{told()}"
+    assert REMEDY.search(message), f"no remedy\n{told()}"
+    assert len(re.split(r"[;:,.] ", message)) > 1, f"no more than one clause\n{told()}"
     return error

@@ -4,6 +4,7 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -127,7 +128,21 @@ def test_elements_that_do_not_fit_are_named(case, plan):
     refused(broken(plan).build, *words)
 
 
-NO_ELEMENTS = [None, 3, "bodies", {"a": 1}, [None], ["part"], [lx.RigidBody], [lx.GROUND], [[]], print, [3.0]]
+NO_ELEMENTS = [
+    None,
+    3,
+    np.array("s"),
+    jnp.ones(()),
+    "bodies",
+    {"a": 1},
+    [None],
+    ["part"],
+    [lx.RigidBody],
+    [lx.GROUND],
+    [[]],
+    print,
+    [3.0],
+]
 
 
 @pytest.mark.parametrize("place", ["bodies", "joints", "forces", "constraints"])

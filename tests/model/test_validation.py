@@ -105,6 +105,22 @@ BAD = {
     "spring of negative length": (lambda: lx.Spring(lx.GROUND, body(), 1.0, -1.0), ["Spring", "'part'", "-1.0"]),
     "friction without a scale": (lambda: lx.JointFriction("pin", 1.0, 0.0), ["'pin'", "scale", "positive"]),
     "force in unknown axes": (lambda: lx.PointForce(body(), [1, 0, 0], "body"), ["'part'", "'body'", "'frame'"]),
+    "rectangle of no material": (lambda: lx.rectangle(0.1, 0.2, 3.0), ["rectangle", "3.0", "lx.Material"]),
+    "circle of no material": (lambda: lx.circle(0.1, "steel"), ["circle", "'steel'", "lx.Material"]),
+    "rope over a number": (lambda: lx.Rope("hoist", np.nan, 1.0), ["'hoist'", "points", "nan", "list of bodies"]),
+    "rope over one body": (lambda: lx.ElasticRope(body(), 1.0, 1.0), ["ElasticRope", "points", "list of bodies"]),
+    "rope over a name": (lambda: lx.ElasticRope(["part", body()], 1.0, 1.0), ["ElasticRope", "'part'", "bodies"]),
+    "force on the ground": (lambda: lx.PointForce(lx.GROUND, [1, 0, 0]), ["PointForce", "'ground'", "nothing moves"]),
+    "moment on the ground": (
+        lambda: lx.PointMoment(lx.GROUND.at([1, 0, 0]), [1, 0, 0]),
+        ["PointMoment", "'ground'", "nothing moves"],
+    ),
+    "spring on the ground": (lambda: lx.Spring(lx.GROUND, lx.GROUND, 1.0), ["Spring", "'ground'", "two bodies"]),
+    "damper on the ground": (lambda: lx.Damper(lx.GROUND, lx.GROUND, 1.0), ["Damper", "'ground'", "two bodies"]),
+    "rope on the ground": (
+        lambda: lx.ElasticRope([lx.GROUND, lx.GROUND], 1.0, 1.0),
+        ["ElasticRope", "'ground'", "two bodies"],
+    ),
     "torque that is not finite": (lambda: lx.JointTorque("pin", np.inf), ["'pin'", "inf", "finite"]),
 }
 

@@ -69,7 +69,7 @@ OPTIONS = {
     "adjoint": ["reverse", 3, diffrax.ForwardMode, diffrax.BacksolveAdjoint()],
     "event": [3, lambda t, state, mechanism: t > 1.0, diffrax.Event],
     "progress_meter": ["bar", True, diffrax.TextProgressMeter],
-    "dtype": ["banana", int, complex, jnp.float16, 3, object],
+    "dtype": ["banana", int, complex, jnp.float16, 3, object, jnp.ones(2), np.float64(1.0)],
 }  # fmt: skip
 UNNAMED_VALUES = ("saveat", "solver", "stepsize_controller", "event", "dtype", "adjoint", "progress_meter")
 CASES = [(name, index) for name, values in OPTIONS.items() for index in range(len(values))]

@@ -25,6 +25,7 @@ from linkax.model.numbers import (
     instance,
     known,
     number,
+    one_of,
     positive,
     real,
     require,
@@ -93,8 +94,7 @@ class Beam(AbstractBody):
         self.elements = whole_number(elements, f"{what}: elements")
         flags = {"torsion": torsion, "stretch": stretch, "shear": shear}
         torsion, stretch, shear = (flag(entry, f"{what}: {name}") for name, entry in flags.items())
-        if bends not in ("yz", "y", "z", ""):
-            raise ValueError(f"{what}: bends is {bends!r}; known: 'yz', 'y', 'z', ''")
+        one_of(bends, ("yz", "y", "z", ""), f"{what}: bends")
         asked = [torsion, "y" in bends, "z" in bends, stretch, shear and "z" in bends, shear and "y" in bends]
         self.strains = tuple(np.flatnonzero(asked).tolist())
         if not self.strains:
@@ -126,8 +126,8 @@ class Beam(AbstractBody):
             return Frame(ends[where], np.zeros(3), axes)
         what = f"place of a frame on beam {self.name!r} [m]"
         offset = real(where, what)
+        offset = number(offset, () if offset.shape == () else (3,), what)
         offset = offset * np.eye(3)[0] if offset.shape == () else offset
-        offset = number(offset, (3,), what)
         if element is not None:
             whole_number(element, f"{what}: element", least=0, most=self.elements - 1)
             return Place(self.name, self.within(offset, what, element, element + 1), axes, int(element))

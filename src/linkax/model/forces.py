@@ -7,10 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from linkax.model.bodies import Frame, frame_of
+from linkax.model.bodies import GROUND_NAME, Frame, frame_of
 from linkax.model.elements import AbstractElement
 from linkax.model.functions import Law, evaluated, number_or_law, raised
-from linkax.model.numbers import number, positive, zero_or_more
+from linkax.model.numbers import number, one_of, positive, zero_or_more
 from linkax.model.terms import Term, term
 from linkax.spatial.vectors import dot
 
@@ -290,9 +290,9 @@ class _OnPoint(AbstractForce):
 
     def __init__(self, point, axes):
         self.point = frame_of(point, f"{type(self).__name__}: point")
-        if axes not in ("ground", "frame"):
-            raise ValueError(f"{self.described}: axes is {axes!r}; known: 'ground', 'frame'")
-        self.axes = axes
+        if self.point.body == GROUND_NAME:
+            raise ValueError(f"{self.described}: point is {point!r}, which nothing moves; give a point of another body")
+        self.axes = one_of(axes, ("ground", "frame"), f"{self.described}: axes")
 
     @property
     def frames(self):

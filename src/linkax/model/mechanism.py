@@ -1,7 +1,6 @@
 """A mechanism: bodies, joints, constraints and forces, checked, with its spanning tree."""
 
 from collections import Counter
-from collections.abc import Iterable
 
 import equinox as eqx
 
@@ -13,7 +12,7 @@ from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
-from linkax.model.numbers import flag, instance
+from linkax.model.numbers import flag, listed
 from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
 
 
@@ -47,16 +46,15 @@ class Mechanism(eqx.Module):
     topology: Topology = eqx.field(static=True)
 
     def __init__(self, bodies, joints, forces=(), constraints=(), *, all_rows=False):
-        constraints = _checked(
-            constraints, (AbstractConstraint, Distance), "constraints", "Coupling, Drive, Rope or Distance"
-        )
-        joints = _checked(joints, AbstractJoint, "joints", "Revolute, Prismatic and their like")
+        related = "give a list of Coupling, Drive, Rope or Distance"
+        constraints = listed(constraints, (AbstractConstraint, Distance), "constraints", related)
+        joints = listed(joints, AbstractJoint, "joints", "give a list of Revolute, Prismatic and their like")
         joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
         constraints = [c for c in constraints if not isinstance(c, Distance)]
-        bodies = _checked(bodies, (RigidBody, Beam), "bodies", "RigidBody or Beam")
+        bodies = listed(bodies, (RigidBody, Beam), "bodies", "give a list of RigidBody or Beam")
         if not bodies:
             raise ValueError("bodies is empty, []; give at least one body")
-        forces = _checked(forces, AbstractForce, "forces", "Gravity, Spring and their like")
+        forces = listed(forces, AbstractForce, "forces", "give a list of Gravity, Spring and their like")
         beams = [body for body in bodies if isinstance(body, Beam)]
         bodies, joints, forces, constraints = taken_apart(bodies, joints, forces, constraints)
         by_name, joint_by_name = _by_name(bodies, "body"), _by_name(joints, "joint")
@@ -117,12 +115,6 @@ def _find(name, names, what):
     if name not in names:
         raise ValueError(f"unknown {what} {name!r}; known: {', '.join(map(repr, names))}")
     return names.index(name)
-
-
-def _checked(elements, kind, what, called):
-    if not isinstance(elements, Iterable):
-        raise ValueError(f"{what} is {elements!r}; give a list of {called}")
-    return [instance(element, kind, f"an entry of {what}", f"give a list of {called}") for element in elements]
 
 
 def _by_name(elements, what):

@@ -115,11 +115,27 @@ def flag(entry, what: str) -> bool:
     return bool(entry)
 
 
+def one_of(entry, choices: tuple[str, ...], what: str) -> str:
+    """One of several words."""
+    if not isinstance(entry, str) or entry not in choices:
+        raise ValueError(f"{what} is {entry!r}; known: {', '.join(map(repr, choices))}")
+    return entry
+
+
 def instance(entry, kind, what: str, remedy: str):
     """Something of a kind, or of one of several."""
     if not isinstance(entry, kind):
         raise ValueError(f"{what} is {entry!r}; {remedy}")
     return entry
+
+
+def listed(entries, kind, what: str, remedy: str) -> list:
+    """A list of things of a kind, or of one of several."""
+    try:
+        found = list(entries)
+    except TypeError as error:
+        raise ValueError(f"{what} is {entries!r}; {remedy}") from error
+    return [instance(entry, kind, f"an entry of {what}", remedy) for entry in found]
 
 
 def require(array, condition, what: str, remedy: str):

@@ -6,17 +6,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from linkax.model.bodies import Frame, frame_of
+from linkax.model.bodies import AbstractBody, Frame, frame_of
 from linkax.model.constraints import AbstractConstraint, checked_name
 from linkax.model.forces import AbstractForce, Load
 from linkax.model.functions import Law, evaluated
-from linkax.model.numbers import positive, zero_or_more
+from linkax.model.numbers import listed, positive, zero_or_more
 from linkax.spatial.vectors import dot, length
 
 Points = tuple[Frame, ...]
 
 
 def _points(points, what) -> Points:
+    remedy = "give a list of bodies, body.at(...), or lx.GROUND.at(...)"
+    points = listed(points, (AbstractBody, Frame), f"{what}: points", remedy)
     points = tuple(frame_of(point, f"{what}: a point") for point in points)
     if len(points) < 2:
         raise ValueError(f"{what} has {len(points)} points; give two or more, in the order of the rope")

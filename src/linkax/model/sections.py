@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import known, namespace, number, positive, require
+from linkax.model.numbers import instance, known, namespace, number, positive, real, require
+
+GIVE_MATERIAL = "give a lx.Material(youngs_modulus, poissons_ratio, density)"
 
 
 class Material(eqx.Module):
@@ -99,8 +101,8 @@ class Section(eqx.Module):
 
 def _pair(entry, what):
     """Two numbers, or one for both."""
-    single = np.ndim(entry) == 0
-    return number([entry, entry] if single else entry, (2,), what)
+    array = real(entry, what)
+    return number(array * np.ones(2) if array.shape == () else array, (2,), what)
 
 
 def _both(entry, what):
@@ -139,6 +141,7 @@ def rectangle(width, height, material: Material, thickness=None) -> Section:
     **Raises:** `ValueError` for a size that is not positive, and for walls that do not fit.
     """
     width, height = positive(width, "rectangle: width [m]"), positive(height, "rectangle: height [m]")
+    instance(material, Material, "rectangle: material", GIVE_MATERIAL)
     ratio = material.poissons_ratio
     if thickness is None:
         long, short = jnp.maximum(width, height), jnp.minimum(width, height)
@@ -177,6 +180,7 @@ def circle(diameter, material: Material, thickness=None) -> Section:
     **Raises:** `ValueError` for a size that is not positive, and for walls that do not fit.
     """
     diameter = positive(diameter, "circle: diameter [m]")
+    instance(material, Material, "circle: material", GIVE_MATERIAL)
     inner = 0.0 * diameter
     if thickness is not None:
         inner = diameter - 2.0 * _wall(thickness, (diameter,), "circle: thickness [m]")

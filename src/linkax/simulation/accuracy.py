@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.model.numbers import number, require
+from linkax.model.numbers import number, one_of, require
 
 Projection = Literal["both", "stage", "step", "none"]
 Metric = Literal["mass", "identity"]
@@ -47,8 +47,8 @@ class Accuracy(eqx.Module):
         self.atol = self.rtol if atol is None else _number("atol", atol)
         self.rank_tolerance = None if rank_tolerance is None else _number("rank_tolerance", rank_tolerance)
         self.clearance = _number("clearance", clearance, zero=True)
-        self.projection = _one_of("projection", projection, get_args(Projection))
-        self.metric = _one_of("metric", metric, get_args(Metric))
+        self.projection = one_of(projection, get_args(Projection), "projection")
+        self.metric = one_of(metric, get_args(Metric), "metric")
 
     def method(self, dtype, rank_nearby=None) -> TangentSpace:
         """The paper's method at this accuracy, for numbers of the given type."""
@@ -65,12 +65,6 @@ def _number(name, value, zero=False):
     kind = "zero or more" if zero else "positive"
     right = lambda x: ((x > 0.0) | (zero & (x == 0.0))) & (x <= 1.0)
     return require(number(value, (), name), right, name, f"it must be {kind}, and at most 1, such as 1e-8")
-
-
-def _one_of(name, value, choices):
-    if value not in choices:
-        raise ValueError(f"{name} is {value!r}; known: {', '.join(map(repr, choices))}")
-    return value
 
 
 # Measured by `python -m benchmarks.work_precision --vary nothing`: the largest error over 10 s on eleven problems, of

@@ -144,11 +144,12 @@ def by_joint(mechanism: Mechanism, given, what: str, count) -> Given:
             raise ValueError(
                 f"{what} of joint {joint.name!r}: index {along.index}; it has {most} speeds, counted from 0"
             )
-        scalar = np.ndim(entry) == 0
-        if scalar and expected != 1:
-            raise ValueError(f"{what} of joint {joint.name!r} is one number; the joint has {expected} of them")
+        of_joint = f"{what} of joint {joint.name!r}"
+        array = real(entry, of_joint)
+        if array.shape == () and expected != 1:
+            raise ValueError(f"{of_joint} is one number; the joint has {expected} of them")
         terms.append(along)
-        values.append(number([entry] if scalar else entry, (expected,), f"{what} of joint {joint.name!r}"))
+        values.append(number(array[None] if array.shape == () else array, (expected,), of_joint))
     return Given(tuple(terms), tuple(values))
 
 

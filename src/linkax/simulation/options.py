@@ -107,7 +107,8 @@ def _check_times(ts, what, t0, t1):
 def floating(dtype) -> np.dtype:
     """The type of the numbers of a run."""
     try:
-        found = jnp.dtype(float if dtype is None else dtype).name
+        is_array = isinstance(dtype, jax.Array | np.ndarray | np.generic)
+        found = "none" if is_array else jnp.dtype(float if dtype is None else dtype).name
     except TypeError:
         found = "none"
     if found not in FLOATS:

@@ -15,7 +15,7 @@ from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known, number, require
+from linkax.model.numbers import known, number, one_of, real, require
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.given import check_accuracy, checked_state, checked_time, sound_numbers
 from linkax.simulation.instant import Instant, Pose, Power, Violation
@@ -267,8 +267,7 @@ class Solution(eqx.Module):
     def _of_joint(self, function, name, on, axes):
         """Of reactions of all joints, so that all names share a program, those of one."""
         for what, entry, choices in (("on", on, get_args(Side)), ("axes", axes, get_args(Axes))):
-            if entry not in choices:
-                raise ValueError(f"{what} is {entry!r}; known: {', '.join(map(repr, choices))}")
+            one_of(entry, choices, what)
         self.mechanism.joint(name)
         index = self.mechanism.topology.joints.index(name)
         force, moment = _in_motion(function, self, on, axes)
@@ -297,9 +296,10 @@ class Solution(eqx.Module):
             offset = jnp.broadcast_to(frame.offset, (*self.ts.shape[:-1], 3))
             return read(function, self, self._index(frame.body), offset)
         what = f"point on body {body!r} [m]"
-        if isinstance(found, Beam) and np.ndim(at) == 0:
-            at = number(at, (), what) * np.eye(3)[0]
-        offset = number(at, (3,), what)
+        offset = real(at, what)
+        if isinstance(found, Beam) and offset.shape == ():
+            offset = number(offset, (), what) * np.eye(3)[0]
+        offset = number(offset, (3,), what)
         offset = found.within(offset, what) if isinstance(found, Beam) else offset
         offset = jnp.broadcast_to(offset, (*self.ts.shape[:-1], 3))
         if isinstance(found, Beam):
