@@ -13,6 +13,7 @@ PIN = lx.Revolute("pin", lx.GROUND, LINK, "z")
 STEEL = lx.Material(2.1e11, 0.3, 7850.0)
 BOOM = lx.Beam("boom", 1.0, lx.rectangle(0.1, 0.2, STEEL), elements=2)
 ENDS = {"parent": lx.GROUND, "child": LINK}
+MECHANISM = lx.Mechanism([LINK], [PIN])
 PAIR = {"first": LINK, "second": lx.GROUND}
 CALLS = {
     "RigidBody": (lx.RigidBody, {
@@ -62,6 +63,8 @@ CALLS = {
     "Mechanism": (lx.Mechanism, {
         "bodies": [LINK], "joints": [PIN], "forces": [], "constraints": [], "all_rows": False,
     }),
+    "body of a mechanism": (MECHANISM.body, {"name": "link"}),
+    "joint of a mechanism": (MECHANISM.joint, {"name": "pin"}),
     "Accuracy": (lx.Accuracy, {
         "rtol": 1e-8, "atol": 1e-8, "projection": "both", "rank_tolerance": 1e-6, "clearance": 0.0, "metric": "mass",
     }),

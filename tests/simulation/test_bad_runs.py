@@ -485,3 +485,10 @@ def test_numbers_of_a_users_own_may_be_what_they_are():
     }
     for force in made.values():
         assert jax.jit(lambda limit, force=force: sound_numbers(_pendulum(lambda link: force(limit))))(jnp.nan)
+
+
+def test_what_was_marked_is_told_outside_of_transformations_too():
+    marked = jax.vmap(lambda slack: _of_numbers(**POSSIBLE | {"slack": slack}))(jnp.array([1.0, -3.0]))
+    right, wrong = (jax.tree.map(lambda leaf, member=member: leaf[member], marked) for member in (0, 1))
+    results = [lx.Solution.of_state(mechanism, AT_REST).result for mechanism in (right, wrong)]
+    assert [bool(result == lx.RESULTS.not_finite) for result in results] == [False, True]

@@ -48,9 +48,9 @@ def inverse_dynamics(mechanism: Mechanism, state: State, accelerations, *, t=0.0
     **Raises:** `ValueError` where the loops do not allow the accelerations together, naming the joint.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
-    if not accelerations:
-        raise ValueError("inverse_dynamics needs accelerations; give {joint: acceleration, ...}")
     wanted = by_joint(mechanism, accelerations, "acceleration", lambda joint: len(joint.speed_units))
+    if not wanted.terms:
+        raise ValueError("inverse_dynamics needs accelerations; give {joint: acceleration, ...}")
     acceleration, forces, misses = _inverse_dynamics(mechanism, state, wanted, t)
     if known(acceleration) is not None:
         if not np.all(np.isfinite(acceleration)):

@@ -112,7 +112,7 @@ class Mechanism(eqx.Module):
 
 
 def _find(name, names, what):
-    if name not in names:
+    if not isinstance(name, str) or name not in names:
         raise ValueError(f"unknown {what} {name!r}; known: {', '.join(map(repr, names))}")
     return names.index(name)
 

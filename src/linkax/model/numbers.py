@@ -59,7 +59,8 @@ def number(entry, shape: tuple[int, ...], what: str):
 
 def is_finite(array):
     """Whether all numbers of an array are."""
-    return namespace(array).isfinite(array).all()
+    concrete = known(array)
+    return jnp.isfinite(array).all() if concrete is None else np.isfinite(concrete).all()
 
 
 def real(entry, what: str):

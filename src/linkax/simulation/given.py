@@ -17,7 +17,6 @@ from linkax.model.numbers import instance, is_finite, known, namespace, number, 
 from linkax.model.terms import Term, term
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.state import State
-from linkax.tracing import all_known
 
 
 class Given(eqx.Module):
@@ -58,22 +57,22 @@ def check_mechanism(mechanism):
 
 
 def sound_numbers(mechanism) -> Bool[Array, ""] | np.bool_:
-    """Whether no traced number of a mechanism is one that cannot be, see `linkax.model.numbers.require`.
+    """Whether no number of a mechanism that is or was traced is one that cannot be, see `linkax.model.numbers.require`.
 
     What a user's own elements and functions hold is not looked at.
     """
     places = (mechanism.bodies, mechanism.beams, mechanism.joints, mechanism.forces, mechanism.constraints)
     own = [element for element in chain(*places) if type(element).__module__.startswith("linkax.")]
     leaves = jax.tree.leaves(own, is_leaf=lambda node: isinstance(node, Law))
-    traced = [leaf for leaf in leaves if isinstance(leaf, jax.core.Tracer)]
-    return reduce(and_, map(is_finite, traced), np.True_)
+    # An array of NumPy was known when the mechanism was built, and checked there.
+    return reduce(and_, map(is_finite, filter(eqx.is_array, leaves)), np.True_)
 
 
 def marked(mechanism, found):
     """What was found of a mechanism, with NaN for its numbers where `sound_numbers` is false."""
-    if all_known(mechanism):
-        return found
     sound = sound_numbers(mechanism)
+    if known(sound):
+        return found
     mark = lambda leaf: jnp.where(sound, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
     return jax.tree.map(mark, found)
 

@@ -133,8 +133,8 @@ def simulate(
     mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
     # Compiled apart, so that another solver, formulation or saveat compiles no more than it must.
     outset = _start(mechanism, state, t0, accuracy)
-    if not all_known(mechanism):
-        outset = outset.of_numbers(sound_numbers(mechanism))
+    if not known(sound := sound_numbers(mechanism)):
+        outset = outset.of_numbers(sound)
     found, formulation = _integrate(
         mechanism,
         accuracy,

@@ -24,7 +24,7 @@ from linkax.simulation.passages import Passages, passages
 from linkax.simulation.results import RESULTS
 from linkax.simulation.rows import over_rows
 from linkax.simulation.state import State
-from linkax.tracing import all_known, compiled
+from linkax.tracing import compiled
 
 FEW = 100_000  # times of all members: reading more, or beams, takes longer than compiling
 
@@ -72,8 +72,8 @@ class Solution(eqx.Module):
         check_accuracy(accuracy)
         t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
         result = RESULTS.successful
-        if not all_known(mechanism):
-            result = RESULTS.where(sound_numbers(mechanism), result, RESULTS.not_finite)
+        if not known(sound := sound_numbers(mechanism)):
+            result = RESULTS.where(sound, result, RESULTS.not_finite)
         return Solution(
             mechanism=mechanism,
             accuracy=accuracy,
@@ -152,7 +152,7 @@ class Solution(eqx.Module):
         With redundant constraints, reactions are not unique: these are of minimum norm, and
         `reaction_unique` tells which components can be relied upon.
         """
-        if name in self.mechanism.topology.constraints:
+        if self._is_constraint(name):
             return self._of_constraint(Instant.constraint_forces, name)
         return self._of_joint(Instant.reactions, name, on, axes)
 
@@ -163,7 +163,7 @@ class Solution(eqx.Module):
         (Wojtyra, Multibody System Dynamics 13, 2005). Rigid bodies determine no more: the rest
         depends on elasticity, assembly, and here on the choice of the tree.
         """
-        if name in self.mechanism.topology.constraints:
+        if self._is_constraint(name):
             return self._of_constraint(Instant.unique_constraint_forces, name)
         return self._of_joint(Instant.unique, name, on, axes)
 
@@ -259,6 +259,9 @@ class Solution(eqx.Module):
             during = lambda t: (t >= first) & (t <= last)
             t = require(t, during, "t [s]", f"give a time of the run, from {first} s to {last} s")
         return _evaluate(dataclasses.replace(self, repeat=None), t)
+
+    def _is_constraint(self, name):
+        return isinstance(name, str) and name in self.mechanism.topology.constraints
 
     def _of_constraint(self, function, name):
         """Of all constraints, so that all names share a program, that of one."""
