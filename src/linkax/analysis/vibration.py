@@ -45,7 +45,7 @@ _STATICS = Accuracy(metric="identity")
 class EquilibriumError(RuntimeError):
     """No equilibrium was found; `state` is where the search stopped."""
 
-    def __init__(self, message, state):
+    def __init__(self, message, state=None):  # the message alone is what pickle gives, the rest follows
         super().__init__(message)
         self.state = state
 

@@ -74,6 +74,6 @@ class AccuracyWarning(UserWarning):
 class SimulationError(RuntimeError):
     """A simulation that did not reach its end; `solution` holds the part computed."""
 
-    def __init__(self, message, solution):
+    def __init__(self, message, solution=None):  # the message alone is what pickle gives, the rest follows
         super().__init__(message)
         self.solution = solution

@@ -1,6 +1,7 @@
 """How sure parameters are that measurements gave."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -60,16 +61,16 @@ def uncertainty(residual, slopes, free, z) -> Uncertainty:
     undetermined = np.any((each > 0.0) & (together > INVOLVED * each), axis=1)
     covariance[undetermined, undetermined] = np.inf
     deviation = noise * np.sqrt(np.where(lost, np.inf, np.diagonal(to_free)))
-    _, unravel = ravel_pytree(free.params(z))
-
-    def spread(level):
-        """Ends of the intervals, from Student's t distribution."""
-        times, ends = float(scipy.stats.t.ppf(0.5 + level / 2.0, freedom)), []
-        for sign in (-1.0, 1.0):
-            linear = np.asarray(free.vector(z)) + sign * times * np.sqrt(np.diagonal(covariance))
-            moved = np.asarray(free.vector(z + sign * times * deviation))
-            ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(np.where(free.apart, moved, linear)))))
-        return tuple(ends)
-
     names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
-    return Uncertainty(covariance, noise, names, spread)
+    return Uncertainty(covariance, noise, names, partial(_ends, free, z, covariance, deviation, freedom))
+
+
+def _ends(free, z, covariance, deviation, freedom, level):
+    """Ends of the intervals, from Student's t distribution."""
+    _, unravel = ravel_pytree(free.params(z))
+    times, ends = float(scipy.stats.t.ppf(0.5 + level / 2.0, freedom)), []
+    for sign in (-1.0, 1.0):
+        linear = np.asarray(free.vector(z)) + sign * times * np.sqrt(np.diagonal(covariance))
+        moved = np.asarray(free.vector(z + sign * times * deviation))
+        ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(np.where(free.apart, moved, linear)))))
+    return tuple(ends)
