@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from linkax.cli import main
+from linkax.cli import main, options
 
 KEYS = {
     "scene", "variant", "t1", "preset", "steps", "compile_s", "run_s", "optimised", "position_violation",
@@ -87,6 +87,7 @@ def test_json_is_one_object_and_files_are_whole(capsys, tmp_path):
 
 def test_summary_for_people(capsys, tmp_path):
     command = ["simulate", "pendulum", "--t1", "2", "--preset", "draft", "--out", str(tmp_path), "--no-plots"]
+    (tmp_path / "trajectory-interrupted.npz").write_text("of an earlier run")
     assert main(command) == 0
     printed = capsys.readouterr().out
     for word in ("successful", "steps", "compile time", "run time", "position violation", "energy change", "bob"):
@@ -94,10 +95,15 @@ def test_summary_for_people(capsys, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "trajectory.npz"}
 
 
-def test_compare_prints_verdicts_and_keeps_them(capsys, tmp_path):
+def test_compare_prints_verdicts_and_keeps_them(capsys, tmp_path, monkeypatch):
     names = "tangent-space,lagrange-multipliers,moore-penrose-svd+partitioning"
     command = ["compare", "pendulum", "--t1", "2", "--formulations", names, "--out", str(tmp_path)]
+    kept = []
+    monkeypatch.setattr(options, "at_interrupt", lambda keep: kept.append(keep()))
     assert main(command) == 0
+    part = f"what was compared is in {tmp_path / 'comparison-interrupted.json'}"
+    assert kept == ["", part, part, part, f"the comparison is in {tmp_path / 'comparison.json'}"]
+    assert {path.name for path in tmp_path.iterdir()} == {"comparison.json", "comparison.png"}
     printed = capsys.readouterr().out
     kept = json.loads((tmp_path / "comparison.json").read_text())
     assert kept["answer"] == "closed form"

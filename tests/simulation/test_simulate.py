@@ -60,15 +60,19 @@ def test_poses_are_those_of_each_body():
 def test_a_run_in_segments_is_the_run(monkeypatch, worth, optimised):
     monkeypatch.setattr(segments, "LONG_RUN", 0.0)
     monkeypatch.setattr(segments, "WORTH_OPTIMISING", worth)
-    told, mechanism = [], pendulum()
+    told, kept, mechanism = [], [], pendulum()
     state = lx.assemble(mechanism, {"pivot": 0.3})
     options = {"t1": 2.0, "accuracy": lx.PRECISE}
-    found = segments.simulate_in_segments(mechanism, state, **options, report=lambda *now: told.append(now))
+    found = segments.simulate_in_segments(
+        mechanism, state, **options, report=lambda *now: told.append(now), keep=kept.append
+    )
     assert found.optimised == optimised
     assert (("optimising", None) in told) == optimised
     assert told[-1] == ("integrating", pytest.approx(0.95))
     whole = lx.simulate(mechanism, state, saveat=diffrax.SaveAt(ts=found.solution.ts), **options)
     np.testing.assert_allclose(found.solution.ts, np.linspace(0.0, 2.0, 1001), rtol=1e-15)
+    np.testing.assert_allclose([part.t_end for part in kept], np.linspace(0.0, 2.0, 21)[1:], rtol=1e-15)
+    np.testing.assert_array_equal(kept[4].q, found.solution.q[:251])
     np.testing.assert_allclose(found.solution.q, whole.q, atol=1e-10)
 
 

@@ -1,16 +1,19 @@
 """`linkax compare SCENE`: formulations side by side."""
 
 import json
+from functools import partial
 
 from linkax.cli.options import (
     Run,
     add_run_options,
+    at_interrupt_in,
     end_progress,
     one_of,
     output_folder,
     positive,
     progress,
     steps_in_words,
+    write_json,
 )
 from linkax.formulations.named import BASES, COMPARED, TANGENT_SPACE, formulation
 from linkax.simulation.files import written_whole
@@ -19,6 +22,7 @@ from linkax.studies.comparison import TIGHTEST, Comparison, Stepping, at_equal_c
 
 LADDER = (1e2, 1e1, 1.0, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances, of the one asked for, from which equal cost chooses
 STEP_LADDER = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # steps likewise
+PART = "comparison-interrupted.json"
 EQUAL = {"tolerance": "each at the same tolerance or step", "cost": "each in no more run time than the paper's needs"}
 
 
@@ -48,7 +52,9 @@ def _compare(arguments):
     if arguments.equal == "cost":
         names = {TANGENT_SPACE: None} | names
     mechanism = asked.mechanism.with_all_rows() if arguments.all_rows else asked.mechanism
+    settings = asked.described | {"equal": EQUAL[arguments.equal], "all_rows": arguments.all_rows}
     out = output_folder(arguments.out, f"compare-{asked.scene.name}")
+    at_interrupt_in(out)
     exact = asked.scene.exact
     found = compare(
         mechanism,
@@ -60,23 +66,18 @@ def _compare(arguments):
         exact=None if exact is None else lambda times: exact(asked.parameters, times),
         bound=arguments.bound,
         report=progress,
+        keep=lambda found: at_interrupt_in(out, partial(keep, out, settings, found)),
     )
     trials, budget = found.trials, None
     if arguments.equal == "cost":
         own = Stepping(asked.solver, float(asked.accuracy.rtol), arguments.dt)
         budget = next(t.run_s for t in trials if t.formulation == TANGENT_SPACE and _size(t) == _size(own))
         trials = at_equal_cost(trials, budget)
-    described = asked.described | {
-        "equal": EQUAL[arguments.equal],
-        "budget_s": budget,
-        "all_rows": arguments.all_rows,
-        **found._asdict(),
-        "verdicts": _verdicts(found),
-        "trials": [_entries(trial) for trial in trials],
-    }
-    with written_whole(out / "comparison.json") as path:
-        path.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
+    described = settings | {"budget_s": budget} | _described(found, trials)
+    write_json(out / "comparison.json", described)
     files = [out / "comparison.json"]
+    at_interrupt_in(out, lambda: f"the comparison is in {files[0]}")
+    (out / PART).unlink(missing_ok=True)
     if not arguments.no_plots:
         from linkax.plotting.comparison import plot_comparison  # matplotlib takes its time
 
@@ -99,6 +100,17 @@ def _steppings(asked, arguments):
     return [
         Stepping(asked.solver, rtol=rtol * factor) for factor in LADDER if factor >= 1.0 or rtol * factor >= TIGHTEST
     ]
+
+
+def keep(out, settings, found) -> str:
+    """Write what an interrupted comparison has found, apart from a whole one."""
+    write_json(out / PART, settings | _described(found, found.trials) | {"result": "interrupted"})
+    return f"what was compared is in {out / PART}"
+
+
+def _described(found, trials) -> dict:
+    """A comparison for JSON."""
+    return found._asdict() | {"verdicts": _verdicts(found), "trials": [_entries(trial) for trial in trials]}
 
 
 def _entries(trial):

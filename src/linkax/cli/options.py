@@ -1,17 +1,20 @@
 """What the commands share: options, how they are read, and a line on what happens now."""
 
 import argparse
+import json
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import diffrax
 
 import linkax as lx
 from linkax.scenes import scene
-from linkax.simulation.files import writable_folder
+from linkax.simulation.files import remove_unfinished, writable_folder, written_whole
 from linkax.simulation.runge_kutta import RungeKutta4
 from linkax.simulation.simulate import default_solver
+from linkax_command import at_interrupt
 
 PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
 OF_DIFFRAX = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno5")
@@ -94,6 +97,22 @@ def _path(text):
 def output_folder(asked: Path | None, name: str) -> Path:
     """The folder asked for, or one of that name under linkax-out; tried before the run."""
     return writable_folder(Path("linkax-out") / name if asked is None else asked, "give another by --out")
+
+
+def write_json(path: Path, described):
+    """Write a file of one JSON object."""
+    with written_whole(path) as unfinished:
+        unfinished.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
+
+
+def at_interrupt_in(folder: Path, keep: Callable[[], str] = lambda: ""):
+    """Have Ctrl-C leave whole files alone in a folder, and `keep` what has been computed, see `at_interrupt`."""
+
+    def leave():
+        remove_unfinished(folder)
+        return keep()
+
+    at_interrupt(leave)
 
 
 def _changes(assignments):

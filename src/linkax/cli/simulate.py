@@ -5,15 +5,25 @@ import sys
 
 import numpy as np
 
-from linkax.cli.options import Run, add_run_options, end_progress, output_folder, progress, steps_in_words
+from linkax.cli.options import (
+    Run,
+    add_run_options,
+    at_interrupt_in,
+    end_progress,
+    output_folder,
+    progress,
+    steps_in_words,
+    write_json,
+)
 from linkax.formulations.named import TANGENT_SPACE, formulation
 from linkax.simulation.diagnosis import cause
 from linkax.simulation.files import written_whole
-from linkax.simulation.report import summary, trajectory
+from linkax.simulation.report import states, summary, trajectory
 from linkax.simulation.segments import simulate_in_segments
 
 INTERVALS = 1000
 SHOWN = 5
+PART = ("trajectory-interrupted.npz", "summary-interrupted.json")
 WORTH_TELLING = 0.05  # distance from a singular configuration
 
 
@@ -27,7 +37,9 @@ def add_command(commands):
 
 def _simulate(arguments):
     asked, chosen = Run(arguments), formulation(arguments.formulation)
+    settings = asked.described | {"formulation": arguments.formulation}
     out = output_folder(arguments.out, asked.scene.name)
+    at_interrupt_in(out)
     state = asked.initial(asked.mechanism)
     run = simulate_in_segments(
         asked.mechanism,
@@ -39,14 +51,17 @@ def _simulate(arguments):
         step=arguments.dt,
         intervals=INTERVALS,
         report=progress,
+        keep=lambda solution: at_interrupt_in(out, keeping(out, settings, solution)),
     )
     progress("reading results", None)
-    found = asked.described | {"formulation": arguments.formulation} | summary(run, asked.points)
+    found = settings | summary(run, asked.points)
     with written_whole(out / "trajectory.npz") as path:
         np.savez(path, **trajectory(run.solution, asked.points))
-    with written_whole(out / "summary.json") as path:
-        path.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n")
+    write_json(out / "summary.json", found)
     files = [out / "trajectory.npz", out / "summary.json"]
+    at_interrupt_in(out, lambda: f"the results are in {out}")
+    for name in PART:
+        (out / name).unlink(missing_ok=True)
     if not arguments.no_plots:
         progress("drawing", None)
         from linkax.plotting.pictures import write_pictures  # matplotlib takes its time
@@ -59,6 +74,19 @@ def _simulate(arguments):
     stopped = f"the run stopped at t = {found['t_end']:.6g} s: {found['message']}{cause(run.solution, state)}"
     print(f"linkax: {stopped}", file=sys.stderr)
     return 1
+
+
+def keeping(out, settings, solution):
+    """What writes the motion of an interrupted run, apart from the results of a whole one."""
+    reached, t_end = states(solution), float(solution.t_end)
+
+    def keep():
+        with written_whole(out / PART[0]) as path:
+            np.savez(path, **reached)
+        write_json(out / PART[1], settings | {"result": "interrupted", "t_end": t_end})
+        return f"the motion until t = {t_end:.6g} s is in {out / PART[0]}"
+
+    return keep
 
 
 def _for_people(found, files):

@@ -28,7 +28,7 @@ def written_whole(path: Path, exclusive: bool = False) -> Iterator[Path]:
     **Raises:** `FileExistsError` where `exclusive`, and another process was first.
     """
     # A name that no other process has, on another machine neither.
-    unfinished = path.with_name(f"{UNFINISHED}{os.getpid()}-{uuid.uuid4().hex}-{path.name}")
+    unfinished = path.with_name(_unfinished(f"{uuid.uuid4().hex}-{path.name}"))
     try:
         yield unfinished
         synced(unfinished)
@@ -53,3 +53,13 @@ def synced(path: Path):
     """Wait until a file is on disk, whatever happens to the power then."""
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
+
+
+def remove_unfinished(folder: Path):
+    """Remove what this process was writing, where it is about to end."""
+    for path in folder.glob(_unfinished("*")):
+        path.unlink(missing_ok=True)
+
+
+def _unfinished(name) -> str:
+    return f"{UNFINISHED}{os.getpid()}-{name}"

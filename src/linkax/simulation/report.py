@@ -57,23 +57,12 @@ def finite(number):
 def trajectory(solution: Solution, points) -> dict[str, np.ndarray]:
     """Arrays for an NPZ file, times first, SI units, ground axes.
 
-    - `t`; `q` and `coordinates`, `v` and `speeds`: coordinates and speeds of the tree's joints,
-      and whose each is; `energy`; `rank`; `position_violation`, `velocity_violation`,
-      `acceleration_violation` as in `linkax.Violation`.
+    - `t`, `q`, `v`, `coordinates`, `speeds`: see `states`; `energy`; `rank`; `position_violation`,
+      `velocity_violation`, `acceleration_violation` as in `linkax.Violation`.
     - `position_NAME`, `velocity_NAME`, `acceleration_NAME` of each named point.
     - `force_NAME`, `moment_NAME`: reaction of each joint on its child.
     """
-    topology = solution.mechanism.topology
-    owners = lambda slices: [name for name, taken in slices.items() for _ in range(taken.stop - taken.start)]
-    kept = {
-        "t": solution.ts,
-        "q": solution.q,
-        "v": solution.v,
-        "coordinates": owners(topology.coordinates),
-        "speeds": owners(topology.speeds),
-        "energy": solution.energy(),
-        "rank": solution.rank(),
-    }
+    kept = states(solution) | {"energy": solution.energy(), "rank": solution.rank()}
     kept |= {f"{level}_violation": values for level, values in solution.violation()._asdict().items()}
     for name, (body, at) in points.items():
         kept[f"position_{name}"] = solution.position(body, at)
@@ -81,4 +70,16 @@ def trajectory(solution: Solution, points) -> dict[str, np.ndarray]:
         kept[f"acceleration_{name}"] = solution.acceleration(body, at)
     for joint, reaction in solution.reactions().items():
         kept[f"force_{joint}"], kept[f"moment_{joint}"] = reaction
+    return {name: np.asarray(values) for name, values in kept.items()}
+
+
+def states(solution: Solution) -> dict[str, np.ndarray]:
+    """What of a trajectory compiles nothing.
+
+    `t`; `q` and `coordinates`, `v` and `speeds`: coordinates and speeds of the tree's joints, and whose each is.
+    """
+    topology = solution.mechanism.topology
+    owners = lambda slices: [name for name, taken in slices.items() for _ in range(taken.stop - taken.start)]
+    kept = {"t": solution.ts, "q": solution.q, "v": solution.v}
+    kept |= {"coordinates": owners(topology.coordinates), "speeds": owners(topology.speeds)}
     return {name: np.asarray(values) for name, values in kept.items()}

@@ -48,6 +48,7 @@ def simulate_in_segments(
     step: float | None = None,
     intervals: int = DEFAULT_INTERVALS,
     report: Callable[[str, float | None], None] = lambda phase, fraction: None,
+    keep: Callable[[Solution], None] = lambda solution: None,
 ) -> TimedRun:
     """Integrate from 0 to t1 [s], and tell how far it is.
 
@@ -61,6 +62,7 @@ def simulate_in_segments(
     - `step`: of fixed size [s], instead of steps that adapt.
     - `intervals`: between the saved times, a multiple of 20.
     - `report`: called with what happens now, and with the fraction done where that is known.
+    - `keep`: called with the solution so far, after each segment.
 
     **Returns:** a `TimedRun`; its solution ends with the segment that failed, if one did.
     """
@@ -96,15 +98,19 @@ def simulate_in_segments(
     # A classical formulation keeps what it leaves open: a segment would begin on the loops again.
     if formulation is not None or not _is_long(first, run_s):
         whole, run_s = run(state, 0.0, t1, optimised)
+        keep(whole)
         return TimedRun(whole, compile_s, run_s, optimised)
-    parts, borders = [first], np.linspace(0.0, t1, SEGMENTS + 1)
-    for t0, end in itertools.pairwise(borders[1:]):
-        if parts[-1].result != RESULTS.successful:
+    parts, whole = [first], _joined([first])
+    keep(whole)
+    for t0, end in itertools.pairwise(np.linspace(0.0, t1, SEGMENTS + 1)[1:]):
+        if whole.result != RESULTS.successful:
             break
         report("integrating", float(t0 / t1))
-        part, seconds = run(parts[-1].end, t0, end, optimised)
+        part, seconds = run(whole.end, t0, end, optimised)
         parts, run_s = [*parts, part], run_s + seconds
-    return TimedRun(_joined(parts), compile_s, run_s, optimised)
+        whole = _joined(parts)
+        keep(whole)
+    return TimedRun(whole, compile_s, run_s, optimised)
 
 
 def _is_long(first, seconds):

@@ -103,6 +103,7 @@ def compare(
     bound: float | None = None,
     repeats: int = 3,
     report: Callable[[str, float | None], None] = lambda phase, fraction: None,
+    keep: Callable[[Comparison], None] = lambda found: None,
 ) -> Comparison:
     """Integrate the same motion from 0 to t1 [s] by several formulations.
 
@@ -116,6 +117,7 @@ def compare(
     - `bound`: of the error [m]; default: a hundredth of the mechanism's length.
     - `repeats`: of each run, of which the shortest counts.
     - `report`: called with what happens now, and with the fraction done where that is known.
+    - `keep`: called with the comparison so far, after each formulation.
 
     **Returns:** a `Comparison`, of trials in the order of formulations, for each of these of steppings.
 
@@ -151,16 +153,19 @@ def compare(
     other = run(None, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT), throw=True) if known is None else reference
     bound = DIVERGED * float(system_of(mechanism, float).length) if bound is None else bound
     passages = [float(passage) for passage in reference.passages().times]
-    trials = []
+    uncertainty = float(np.max(_apart(positions(other), answer)))
+    kind = "reference run" if known is None else "closed form"
+    found = Comparison(kind, uncertainty, bound, passages, [])
     for count, (name, formulation) in enumerate(chosen.items()):
         report(f"running {name}", count / len(chosen))
         for stepping in steppings:
             run(formulation, stepping, INSTANT * times)  # compiles, where no formulation before it has
-            found, seconds = _timed(functools.partial(run, formulation, stepping), repeats)
-            apart = np.where(np.isfinite(found.ts), _apart(positions(_plain(found)), answer), 0.0)
-            trials.append(_trial(name, stepping, found, seconds, apart, bound, reference, passages, state))
-    uncertainty = float(np.max(_apart(positions(other), answer)))
-    return Comparison("reference run" if known is None else "closed form", uncertainty, bound, passages, trials)
+            solution, seconds = _timed(functools.partial(run, formulation, stepping), repeats)
+            apart = np.where(np.isfinite(solution.ts), _apart(positions(_plain(solution)), answer), 0.0)
+            trial = _trial(name, stepping, solution, seconds, apart, bound, reference, passages, state)
+            found = found._replace(trials=[*found.trials, trial])
+        keep(found)
+    return found
 
 
 def _check_points(mechanism, points):
