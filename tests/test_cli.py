@@ -1,6 +1,7 @@
 """The command line, as a user meets it."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -147,3 +148,48 @@ def test_compare_tells_when_a_formulation_left_the_motion(capsys, tmp_path):
     assert 0.48 < left["diverged_at"] < 0.6
     assert "loops closed to" in left["why"]
     assert "last singular passage at 0.4825 s" in printed
+
+
+SETTINGS = {"scene": "crank-slider", "variant": "SC1", "t1": 2.0, "parameters": {"rod": 0.3}}
+OTHERS = {
+    "scene": "with scene 'bricard' instead of 'crank-slider'",
+    "variant": "with variant 'bricard' instead of 'SC1'",
+    "t1": "with t1 'bricard' instead of 2.0",
+    "parameters": "with parameters 'bricard' instead of {'rod': 0.3}",
+}
+
+
+@pytest.mark.parametrize("file", ["summary.json", "summary-interrupted.json"])
+def test_results_of_another_run_are_never_replaced(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    files = ("summary.json", "summary-interrupted.json")
+    folder = lambda out=None, **changes: options.output_folder(out, "crank-slider", SETTINGS | changes, files)
+    for name, words in OTHERS.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / file).write_text(json.dumps(SETTINGS | {name: "bricard", "steps": 3}))
+        with pytest.raises(ValueError, match=re.escape(f"{words}; give another folder, or remove this one")):
+            folder(tmp_path / name)
+    for text in ("{", "3", "[1]"):
+        (tmp_path / "scene" / file).write_text(text)
+        with pytest.raises(ValueError, match=f"and {file} cannot be read"):
+            folder(tmp_path / "scene")
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / file).write_text(json.dumps(SETTINGS | {"steps": 3}))
+    assert folder(own) == own
+
+
+def test_each_run_has_a_default_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(**changes):
+        settings = SETTINGS | changes
+        found = options.output_folder(None, "crank-slider", settings, ("summary.json",))
+        (found / "summary.json").write_text(json.dumps(settings))
+        return found.as_posix()
+
+    for _ in range(2):
+        assert run() == "linkax-out/crank-slider"
+        assert run(t1=3.0) == "linkax-out/crank-slider-2"
+        assert run(t1=4.0) == "linkax-out/crank-slider-3"
+        assert run(variant="SC2") == "linkax-out/crank-slider-SC2"

@@ -52,8 +52,13 @@ def _compare(arguments):
     if arguments.equal == "cost":
         names = {TANGENT_SPACE: None} | names
     mechanism = asked.mechanism.with_all_rows() if arguments.all_rows else asked.mechanism
-    settings = asked.described | {"equal": EQUAL[arguments.equal], "all_rows": arguments.all_rows}
-    out = output_folder(arguments.out, f"compare-{asked.scene.name}")
+    settings = asked.described | {
+        "formulations": list(names),
+        "bound_given": arguments.bound,
+        "equal": EQUAL[arguments.equal],
+        "all_rows": arguments.all_rows,
+    }
+    out = output_folder(arguments.out, f"compare-{asked.scene.name}", settings, ("comparison.json", PART))
     at_interrupt_in(out)
     exact = asked.scene.exact
     found = compare(

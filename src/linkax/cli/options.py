@@ -1,6 +1,7 @@
 """What the commands share: options, how they are read, and a line on what happens now."""
 
 import argparse
+import itertools
 import json
 import math
 import sys
@@ -94,9 +95,43 @@ def _path(text):
     return Path(text)
 
 
-def output_folder(asked: Path | None, name: str) -> Path:
-    """The folder asked for, or one of that name under linkax-out; tried before the run."""
-    return writable_folder(Path("linkax-out") / name if asked is None else asked, "give another by --out")
+def output_folder(asked: Path | None, prefix: str, settings: dict, files) -> Path:
+    """The folder asked for, or one under linkax-out that holds no results of other settings; tried before the run.
+
+    `files`: of JSON, that tell the settings of the results in a folder.
+    """
+    found = _free_folder(prefix, settings, files) if asked is None else asked
+    writable_folder(found, "give another by --out")
+    other = _other_setting(found, settings, files)
+    if other is None:
+        return found
+    raise ValueError(
+        f"--out {str(found)!r} holds results of another run, {other}; give another folder, or remove this one"
+    )
+
+
+def _free_folder(prefix, settings, files):
+    """linkax-out/SCENE, -VARIANT where that is not the default, or the first of SCENE-2, ... without other results."""
+    variant = settings["variant"]
+    name = prefix + ("" if variant == scene(settings["scene"]).default_variant else f"-{variant}")
+    names = itertools.chain([name], (f"{name}-{count}" for count in itertools.count(2)))
+    folders = map(Path("linkax-out").joinpath, names)
+    return next(folder for folder in folders if _other_setting(folder, settings, files) is None)
+
+
+def _other_setting(folder, settings, files) -> str | None:
+    """How the results in a folder differ in what was asked for."""
+    for path in map(folder.joinpath, files):
+        try:
+            kept = dict(json.loads(path.read_text()))
+        except OSError:
+            continue
+        except (TypeError, ValueError):
+            return f"and {path.name} cannot be read"
+        for name, value in settings.items():
+            if kept.get(name) != value:
+                return f"with {name} {kept.get(name)!r} instead of {value!r}"
+    return None
 
 
 def write_json(path: Path, described):

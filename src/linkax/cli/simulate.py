@@ -38,7 +38,7 @@ def add_command(commands):
 def _simulate(arguments):
     asked, chosen = Run(arguments), formulation(arguments.formulation)
     settings = asked.described | {"formulation": arguments.formulation}
-    out = output_folder(arguments.out, asked.scene.name)
+    out = output_folder(arguments.out, asked.scene.name, settings, ("summary.json", PART[1]))
     at_interrupt_in(out)
     state = asked.initial(asked.mechanism)
     run = simulate_in_segments(
