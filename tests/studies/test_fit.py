@@ -178,6 +178,66 @@ def test_bad_input():
         lx.fit(lambda p: p["a"] ** 2, {"a": 1.0}, optimiser=optx.LevenbergMarquardt(1e-6, 1e-6))
 
 
+OUTPUTS = {
+    "None, no numbers": lambda p: None,
+    "{}, no numbers": lambda p: {},
+    "no numbers": lambda p: {"gap": p["x"] * jnp.zeros(0), "other": ()},
+    "int64 in its value, which has no derivative": lambda p: jnp.arange(3) + jnp.round(p["x"]).astype(int),
+    "bool in its value, which has no derivative": lambda p: p["x"] > jnp.arange(3),
+    "complex numbers in ['gap']": lambda p: {"gap": 1j * p["x"] * TIMES},
+    "complex numbers in its value": lambda p: 1j * p["x"],
+    "'far' in ['gap']": lambda p: {"gap": "far", "other": p["x"]},
+}
+
+
+@pytest.mark.parametrize("words", OUTPUTS)
+def test_what_is_no_residual_is_named(words):
+    with pytest.raises(ValueError, match=r"the function returned .*" + re.escape(words)):
+        lx.fit(OUTPUTS[words], {"x": 1.0})
+
+
+ROOT = lambda x: jnp.sqrt(jnp.maximum(x, 0.0))  # without derivative from zero down
+
+
+@pytest.mark.parametrize("form", [lambda r: r, jnp.sum], ids=["residual", "loss"])
+def test_where_there_is_no_derivative_is_told(form):
+    with pytest.raises(ValueError, match="no derivative at the parameters where the fit starts"):
+        lx.fit(lambda p: form(p["x"] - TIMES + ROOT(p["y"])), {"x": 1.0, "y": 0.0})
+    function = lambda p: form((p["x"] - 3.0 - 0.0 * TIMES) ** 2 + 0.0 * jnp.where(p["x"] > 1.05, ROOT(-p["x"]), 1.0))
+    with pytest.warns(UserWarning, match="ended 'no derivative': the function is finite"):
+        found = lx.fit(function, {"x": 1.0})
+    assert found.ended == "no derivative"
+    assert found.steps < 20
+    with pytest.raises(ValueError, match="has no covariance, it ended 'no derivative'"):
+        found.interval()
+
+
+EDGES = {
+    "the best lies beyond": lambda p: jnp.where(p["x"] > 2.0, jnp.nan, p["x"] - 3.0) - TIMES / 100.0,
+    "of a flat valley": lambda p: jnp.where(p["x"] > 2.0, jnp.nan, (p["x"] - 2.5) ** 3) - TIMES / 100.0,
+    "with another parameter": lambda p: (jnp.where(p["x"] > 2.0, jnp.nan, p["x"] - 3.0), p["y"] - TIMES),
+}
+
+
+@pytest.mark.parametrize("case", EDGES)
+def test_a_fit_that_is_stuck_at_an_edge_says_so(case):
+    with pytest.warns(UserWarning, match="ended 'at an edge'"):
+        found = lx.fit(EDGES[case], {"x": 1.0, "y": 1.0} if "another" in case else {"x": 1.0})
+    assert found.ended == "at an edge"
+    assert 1.9 < found.params["x"] <= 2.0
+    assert found.covariance is None
+    assert found.undetermined == []
+
+
+@pytest.mark.parametrize("best", [1.5, 1.99])
+def test_a_minimum_before_an_edge_is_found(best):
+    """Though steps on the way to it lead beyond."""
+    function = lambda p: jnp.where(p["x"] > 2.0, jnp.nan, jnp.exp(p["x"]) - jnp.exp(best)) - 1e-3 * jnp.sin(9.0 * TIMES)
+    found = lx.fit(function, {"x": -1.0})
+    assert found.ended == "converged"
+    np.testing.assert_allclose(found.params["x"], best, atol=1e-3)
+
+
 @pytest.mark.slow
 def test_experiments_with_their_own_initial_states():
     """A pendulum's length and damping from three swings, the angles at which they began unknown."""

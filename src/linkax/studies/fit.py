@@ -23,11 +23,17 @@ from linkax.studies.identity import fingerprint
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.parameters import as_arrays
 from linkax.studies.showing import progress_bar
-from linkax.studies.uncertainty import uncertainty
+from linkax.studies.uncertainty import DEPENDENT, uncertainty
 
 DEFAULT_STEPS = {"residual": 100, "loss": 1000}
 DEFAULT_TOLERANCE = 1e-6
 DEFAULT_RATE = 0.02  # of Adam, in parameters that all start near one
+NO_MINIMUM = {
+    "at an edge": "the loss would fall further where the function is not finite, as where no state can be assembled; "
+    "start elsewhere, keep parameters in `linkax.Bounded`, or look whether the model can give these data",
+    "no derivative": "the function is finite at these parameters, and its derivative is not, as that of a square root "
+    "at zero; start elsewhere, or write it such that it has one",
+}
 FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
 
 
@@ -38,10 +44,12 @@ class Fit(NamedTuple):
     - `loss`: the loss, or half the sum of squares of the residual. `residual`: at the end, (n,), or None.
     - `names`: of the p numbers in `params`, in the order of `covariance`.
     - `covariance`: of these numbers, (p, p), from the sensitivities of the residual and its own size; infinite for
-      what the data do not determine; None for a loss. `noise`: standard deviation of the residual.
+      what the data do not determine; None for a loss, and where the fit ended at an edge or without derivative.
+      `noise`: standard deviation of the residual.
     - `undetermined`: names of numbers that the data do not determine.
     - `history`: {"loss": at each step}. `steps`: taken.
-    - `ended`: "converged", "stopped early", "diverged", or "out of steps".
+    - `ended`: "converged", "stopped early", "diverged", or "out of steps"; "at an edge", beyond which the loss would
+      fall but the function is not finite; "no derivative", where the function is finite and that is not.
     """
 
     params: Any
@@ -74,7 +82,10 @@ class Fit(NamedTuple):
 
     def _known_covariance(self):
         if self.covariance is None:
-            raise ValueError("a loss has no covariance: fit a residual, whose sum of squares is the loss")
+            raise ValueError(
+                f"this fit has no covariance, it ended {self.ended!r}: fit a residual, whose sum of squares is the "
+                "loss, and start where steps lead to a minimum"
+            )
         return self.covariance
 
 
@@ -114,16 +125,17 @@ def fit(
 
     **Returns:** a `Fit`.
 
-    **Raises:** `ValueError` for parameters that are no numbers, for a function that is not finite where the fit
-    starts, and for a checkpoint of another fit.
+    **Raises:** `ValueError` for parameters that are no numbers, for a function that returns none, that is not finite
+    or has no derivative where the fit starts, and for a checkpoint of another fit.
 
-    **Warns:** of parameters that the data do not determine.
+    **Warns:** of parameters that the data do not determine; where the fit ended at an edge, or without derivative.
     """
     instance(function, Callable, "function", "give a residual or a loss, a function of (params, *args)")
     free = FreeParameters.of(params)
     args = as_arrays(tuple(instance(args, list | tuple, "args", "give a tuple of what else the function gets")), "args")
     _check_ending(steps, tolerance, patience)
     shape = eqx.filter_eval_shape(lambda z, args: function(free.params(z), *args), free.start, args)
+    _check_output(shape)
     is_loss = isinstance(shape, jax.ShapeDtypeStruct) and shape.shape == ()
     kind = "loss" if is_loss else "residual"
     if mode not in (None, "forward", "reverse"):
@@ -142,8 +154,15 @@ def fit(
     params = jax.tree.map(np.asarray, free.params(z))
     history = {"loss": np.array(losses)}
     if is_loss:
+        _warn_of_no_minimum(ended)
         return Fit(params, min(losses), None, free.names, None, None, [], history, len(losses) - 1, ended, None)
     residual, slopes = (np.asarray(part) for part in _sensitivity(search, z, args))
+    if ended == "converged" and _is_at_edge(search, z, args, residual, slopes, tolerance):
+        ended = "at an edge"
+    loss = float(0.5 * residual @ residual)
+    if ended in NO_MINIMUM:
+        _warn_of_no_minimum(ended)
+        return Fit(params, loss, residual, free.names, None, None, [], history, len(losses) - 1, ended, None)
     found = uncertainty(residual, slopes, free, z)
     if found.undetermined:
         warnings.warn(
@@ -154,7 +173,7 @@ def fit(
         )
     return Fit(
         params,
-        float(0.5 * residual @ residual),
+        loss,
         residual,
         free.names,
         found.covariance,
@@ -165,6 +184,41 @@ def fit(
         ended,
         found.spread,
     )
+
+
+def _warn_of_no_minimum(ended):
+    if ended in NO_MINIMUM:
+        warnings.warn(f"the fit ended {ended!r}: {NO_MINIMUM[ended]}", stacklevel=3)
+
+
+def _check_output(shape):
+    """Whether what the function returns, by `eqx.filter_eval_shape`, can be made small."""
+    kinds = {}
+    for path, leaf in jax.tree.leaves_with_path(shape):
+        name = jax.tree_util.keystr(path) or "its value"
+        try:
+            size, kinds[name] = np.prod(jnp.shape(leaf)), jnp.result_type(leaf)
+        except TypeError as error:
+            raise ValueError(f"the function returned {leaf!r} in {name}; give real numbers") from error
+        if size == 0:
+            del kinds[name]
+        elif jnp.issubdtype(kinds[name], jnp.complexfloating):
+            raise ValueError(f"the function returned complex numbers in {name}; give their real and imaginary parts")
+    if not kinds:
+        raise ValueError(f"the function returned {shape!r}, no numbers; give a residual or a loss")
+    if not any(jnp.issubdtype(kind, jnp.floating) for kind in kinds.values()):
+        raise ValueError(
+            f"the function returned {next(iter(kinds.values()))} in {next(iter(kinds))}, which has no derivative; give "
+            "floating-point numbers"
+        )
+
+
+def _is_at_edge(search, z, args, residual, slopes, tolerance) -> bool:
+    """Whether an undamped step, which promises to lower the loss, leads to where the function is not finite."""
+    step = -np.linalg.lstsq(slopes, residual, rcond=DEPENDENT)[0]
+    left = residual + slopes @ step
+    gains = residual @ residual - left @ left > max(tolerance, np.finfo(float).eps) * (residual @ residual)
+    return bool(gains and not np.all(np.isfinite(_sensitivity(search, z + step, args)[0])))
 
 
 def _check_ending(steps, tolerance, patience):
@@ -226,10 +280,11 @@ class _Squares(_AbstractSearch):
         return self.solver.init(self._residual(), z, args, {"jac": "bwd"}, shape, None, frozenset())
 
     def step(self, z, state, args):
-        """The next z and state, the loss at z, and whether z is the answer."""
+        """The next z and state, the loss at z, whether its derivative is finite, and whether z is the answer."""
         z, state, _ = self.solver.step(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
         done, _ = self.solver.terminate(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
-        return z, state, 0.5 * jnp.sum(state.f_info.residual**2), done
+        smooth = jnp.all(jnp.isfinite(state.f_info.jac.as_matrix()))
+        return z, state, 0.5 * jnp.sum(state.f_info.residual**2), smooth, done
 
 
 class _Descent(_AbstractSearch):
@@ -239,7 +294,7 @@ class _Descent(_AbstractSearch):
         return self.solver.init(z)
 
     def step(self, z, state, args):
-        """The next z and state, the loss at the last z, and False."""
+        """The next z and state, the loss at the last z, whether its derivative is finite, and False."""
 
         def loss(z):
             value = self.flat(z, args)
@@ -249,7 +304,7 @@ class _Descent(_AbstractSearch):
         value, slope = _linearised(loss, z) if forward else jax.value_and_grad(loss)(z)
         solver = optax.with_extra_args_support(self.solver)
         update, state = solver.update(slope, state, z, value=value, grad=slope, value_fn=loss)
-        return optax.apply_updates(z, update), state, value, jnp.zeros((), bool)
+        return optax.apply_updates(z, update), state, value, jnp.all(jnp.isfinite(slope)), jnp.zeros((), bool)
 
 
 @eqx.filter_jit
@@ -275,13 +330,10 @@ def _search(search, args, steps, tolerance, patience, checkpoint, progress):
     with progress_bar(steps, "step", progress, initial=len(losses)) as bar:
         while len(losses) < steps + 1:
             before = z
-            z, state, loss, done = _step(search, z, state, args)
+            z, state, loss, smooth, done = _step(search, z, state, args)
             loss = float(loss)
-            if not losses and not np.isfinite(loss):
-                raise ValueError(
-                    "the function is not finite at the parameters where the fit starts: look at solution.result of a "
-                    "single run with them"
-                )
+            if not losses:
+                _check_start(loss, smooth)
             losses.append(loss)
             # Squares tell the loss at z, descent that at the point before.
             here = z if isinstance(search, _Squares) else before
@@ -292,16 +344,33 @@ def _search(search, args, steps, tolerance, patience, checkpoint, progress):
             bar.update()
             if kept is not None:
                 kept.save((z, best_z, state), losses, waited)
-            if done:
-                ended = "converged"
-                break
             if not np.isfinite(loss):
                 ended = "diverged"
+                break
+            if not smooth:
+                ended = "no derivative"
+                break
+            if done:
+                ended = "converged"
                 break
             if patience is not None and waited >= patience:
                 ended = "stopped early"
                 break
     return best_z, losses, ended
+
+
+def _check_start(loss, smooth):
+    """Whether a search can begin."""
+    if not np.isfinite(loss):
+        raise ValueError(
+            "the function is not finite at the parameters where the fit starts: look at solution.result of a single "
+            "run with them"
+        )
+    if not smooth:
+        raise ValueError(
+            "the function has no derivative at the parameters where the fit starts, as a square root has none at zero; "
+            "start elsewhere, or ask `linkax.differentiability`"
+        )
 
 
 class _Checkpoint(NamedTuple):
