@@ -8,7 +8,6 @@ another thread hears the signal, and ends the process while the main thread rest
 import _thread  # `threading` and `socket` would take their time
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable
 
@@ -78,7 +77,3 @@ def _end():
         os.write(2, f"{os.linesep if os.isatty(2) else ''}{line}{os.linesep}".encode())
     finally:
         os._exit(INTERRUPTED)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
