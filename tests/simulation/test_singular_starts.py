@@ -179,8 +179,6 @@ def test_sarrus_through_seven_passages(rtol):
     """Redundant throughout; the rank falls by one and by two."""
     known = reference("sarrus")
     mechanism, state = raised(np.pi / 3, {"base_x": 0.0})
-    found = lx.simulate(
-        mechanism, state, t1=3.0, accuracy=lx.Accuracy(rtol=rtol), saveat=diffrax.SaveAt(ts=known["t"])
-    )
+    found = lx.simulate(mechanism, state, t1=3.0, accuracy=lx.Accuracy(rtol=rtol), saveat=diffrax.SaveAt(ts=known["t"]))
     for name in ("base_x", "base_y"):
         np.testing.assert_allclose(found.joint(name), known["gamma"], atol=max(1e3 * rtol, 3e-9))
