@@ -13,7 +13,7 @@ from mechanisms import crank_slider
 import linkax as lx
 from linkax.equations.system import system_of
 from linkax.formulations.named import COMPARED, TANGENT_SPACE, formulation
-from linkax.simulation.passages import _between_states
+from linkax.simulation.passages import between_states
 
 COUNT = 3
 
@@ -51,8 +51,10 @@ def test_the_test_sees_them():
 
 
 def test_passages(large):
-    solution = times(*large, 41)
-    assert not batched_calls(_between_states, solution, np.arange(40), np.ones(40))
+    mechanism, state = large
+    pairs = (jnp.tile(part, (COUNT, 2, 1)) for part in (state.q, state.v))
+    ts, places = jnp.tile(jnp.array([0.0, 1.0]), (COUNT, 1)), jnp.ones(COUNT)
+    assert not batched_calls(between_states, mechanism, lx.PRECISE, None, ts, *pairs, places)
 
 
 READINGS = {

@@ -1,8 +1,10 @@
 """What a run tells of singular configurations."""
 
+import diffrax
 import numpy as np
 import pytest
 from known_answers import reference, start
+from mechanisms import raised
 
 import linkax as lx
 
@@ -38,3 +40,24 @@ def test_a_motion_without_passages_tells_none():
     passages = found.passages()
     assert len(passages.times) == 0
     assert passages.digits < 1.0
+
+
+# Of the Sarrus linkage of tests/data/sarrus.csv: on the way down, back up, and down again.
+DOWN = np.array([0.40917685462413299, 0.60608021715391262, 0.80298357968369226])
+TURNS = 1.2121604343078252
+SARRUS = np.concatenate([DOWN, 2.0 * TURNS - DOWN[::-1], [2.0 * TURNS + DOWN[0]]])
+SAVED = {
+    "a few times": np.linspace(0.0, 3.0, 21),
+    "times on passages": np.sort([0.0, *np.linspace(0.1, 2.9, 60), *SARRUS, 3.0]),
+    "many times": np.linspace(0.0, 3.0, 2001),
+}
+
+
+@pytest.mark.parametrize("saved", [*list(SAVED)[:2], pytest.param("many times", marks=pytest.mark.slow)])
+def test_passages_are_found_once_however_the_run_was_saved(saved):
+    """With redundant rows, and two rows lost at once in some."""
+    mechanism, state = raised(np.pi / 3, {"base_x": 0.0})
+    found = lx.simulate(mechanism, state, t1=3.0, accuracy=lx.PRECISE, saveat=diffrax.SaveAt(ts=SAVED[saved]))
+    passages = found.passages()
+    np.testing.assert_allclose(passages.times, SARRUS, atol=1e-7)
+    assert passages.accuracy <= 1e-7

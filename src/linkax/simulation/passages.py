@@ -1,5 +1,6 @@
-"""Passages through singular configurations, read off a motion's saved times."""
+"""Passages through singular configurations, found along a motion however coarsely it was saved."""
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -11,24 +12,67 @@ from diffrax import ThirdOrderHermitePolynomialInterpolation
 from linkax.equations.coordinates import on_manifold, rates
 from linkax.equations.system import system_of
 from linkax.formulations.classical import ClassicalFormulation
+from linkax.simulation.results import ENDED_WELL, result_name
+from linkax.simulation.state import State
 from linkax.tracing import runs_once
 
-REFINEMENTS = 4
+REFINEMENTS = 6
+POLISHES = 2
 VANISHED = 0.1  # of the distances before and after: what a passage falls below
-TOGETHER = 1e-3  # of the time between saved states: passages that close are of several loops at once
+TOGETHER = 1e-6  # of the whole time: passages that close are of several loops at once
+SINGULAR = 1e-4  # distance below which a state is on no side of a passage
+FASTEST = 10.0  # that distances change, per radian or length of the mechanism
+BATCH = 64  # intervals that one program looks at
 
 
 class Passages(NamedTuple):
     """Times at which a motion goes through singular configurations [s], and what they cost.
 
-    - `times`: (n,), rising. Between two passages of the same loop there must be a saved time.
+    - `times`: (n,), rising.
     - `digits`: decimal digits of the state that the run lost to them: rounding errors of the
       tangential motion grow like 1/d at the stages of steps, d the distance from a singular
       configuration, and add up over the passages. Not a number for a classical formulation.
+    - `accuracy`: what the search may have missed `times` by [s], or not a number without passages. The motion itself is
+      off by as much as `Solution.error_estimate` tells.
     """
 
     times: np.ndarray
     digits: float
+    accuracy: float
+
+
+class Samples(NamedTuple):
+    """States along a motion, and their distances from a singular configuration; times are the first axis."""
+
+    ts: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    distances: np.ndarray
+
+    @staticmethod
+    def of(solution) -> "Samples":
+        reached = np.isfinite(np.asarray(solution.ts))
+        parts = solution.ts, solution.q, solution.v, solution.singularity_distance()
+        return Samples(*(np.asarray(part)[reached] for part in parts))
+
+    def taken(self, which) -> "Samples":
+        return Samples(*(part[which] for part in self))
+
+    def then(self, other: "Samples") -> "Samples":
+        """Both, where the other begins with the last state of this one."""
+        return Samples(*(np.concatenate([part, more[1:]]) for part, more in zip(self, other, strict=True)))
+
+    def pairs(self, before) -> "Samples":
+        """States at both ends of intervals, (k, 2, ...)."""
+        return self.taken(np.stack([before, before + 1], axis=1))
+
+
+class _Found(NamedTuple):
+    """A passage: its time, the coordinates there, and what the search may have missed the time by."""
+
+    time: float
+    q: np.ndarray
+    accuracy: float
 
 
 def passages(solution) -> Passages:
@@ -36,90 +80,168 @@ def passages(solution) -> Passages:
 
     **Raises:** `ValueError` for a batch, or where the solution saved functions of its own.
     """
-    times, _ = singular_states(solution)
+    found = _passages(solution)
+    times = np.array([passage.time for passage in found])
+    accuracy = max((passage.accuracy for passage in found), default=math.nan)
     if isinstance(solution.formulation, ClassicalFormulation):  # which does not measure how close its stages come
-        return Passages(times, math.nan)
+        return Passages(times, math.nan, accuracy)
     lost = np.log10(max(len(times), 1) / max(float(solution.closest), np.finfo(float).eps))
-    return Passages(times, float(max(lost, 0.0)))
+    return Passages(times, float(max(lost, 0.0)), accuracy)
 
 
 def singular_states(solution):
-    """Times at which a motion goes through singular configurations, (n,), and the coordinates there, (n, n_q).
+    """Times at which a motion goes through singular configurations, (n,), and the coordinates there, (n, n_q)."""
+    found = _passages(solution)
+    states = np.array([passage.q for passage in found]).reshape(len(found), solution.q.shape[-1])
+    return np.array([passage.time for passage in found]), states
 
-    J at one saved state times the right inverse of J at the one before has eigenvalues near one;
-    one that is negative has passed through zero between, and that is where it is sought.
+
+def _passages(solution) -> list[_Found]:
+    """All passages, in order.
+
+    J at one state times the right inverse of J at the one before has eigenvalues near one; one that is negative has
+    passed through zero between. It is sought on a polynomial first, and then on the motion, run again from there.
     """
     if solution.ts.ndim != 1:
         raise ValueError(f"passages of a batch of shape {solution.ts.shape[:-1]}; ask for one member at a time")
     if solution.q is None:
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
-    ts = np.asarray(solution.ts)
-    reached = np.flatnonzero(np.isfinite(ts[1:]))
-    ends = [_turned(change) for change in _between(solution, reached, np.ones(len(reached)))[0]]
-    intervals, ends = np.repeat(reached, [len(values) for values in ends]), np.concatenate([np.empty(0), *ends])
-    places, distances, states = _zeros(solution, intervals, ends)
-    around = np.asarray(solution.singularity_distance())
-    vanished = distances <= VANISHED * np.maximum(around[intervals], around[intervals + 1])
-    times = (ts[intervals] + places * (ts[intervals + 1] - ts[intervals]))[vanished]
-    order = np.argsort(times)
-    times, states = times[order], states[vanished][order]
-    spacing = np.max(np.diff(ts[: len(reached) + 1]), initial=0.0)
-    apart = np.diff(times, prepend=-np.inf) > TOGETHER * spacing
-    return times[apart], states[apart]
+    samples = _close_enough(solution)
+    samples = samples.taken(samples.distances > SINGULAR)
+    if len(samples.ts) < 2:
+        return []
+    pairs = samples.pairs(_candidates(solution, samples))
+    turned = [_turned(values) for values in _between(solution, pairs, np.ones(len(pairs.ts)))[0]]
+    pairs = pairs.taken(np.repeat(np.arange(len(turned)), [len(ends) for ends in turned]))
+    places, distances, states = _zeros(solution, pairs, np.concatenate([np.empty(0), *turned]))
+    vanished = distances <= VANISHED * np.max(pairs.distances, axis=1)
+    times = pairs.ts[:, 0] + places * np.diff(pairs.ts, axis=1)[:, 0]
+    found = [_polished(solution, pairs.taken(k), times[k], states[k]) for k in np.flatnonzero(vanished)]
+    found.sort(key=lambda passage: passage.time)
+    whole = TOGETHER * np.ptp(samples.ts)
+    apart = [k for k in range(len(found)) if k == 0 or found[k].time - found[k - 1].time > whole]
+    return [found[k] for k in apart]
 
 
-def _eigenvalues(change):
-    """Ones where a motion that diverged has left no numbers."""
-    return np.linalg.eigvals(change) if np.all(np.isfinite(change)) else np.ones(len(change))
+def _close_enough(solution) -> Samples:
+    """As many states as the run took steps: where fewer were saved, it is run again, part by part."""
+    samples, steps = Samples.of(solution), int(solution.stats.get("num_accepted_steps", 0))
+    if steps < len(samples.ts) or solution.repeat is None or not solution.repeat.has_parts:
+        return samples
+    (state, t0), found = solution.repeat.start, None
+    parts = -(-2 * steps // solution.repeat.num_intervals(solution))
+    for begin, end in itertools.pairwise(np.linspace(float(t0), float(solution.t_end), parts + 1)):
+        part = solution.repeat.part(solution, state, begin, end)
+        if result_name(part.result) not in ENDED_WELL:
+            break
+        more, state = Samples.of(part), part.end
+        found = more if found is None else found.then(more)
+    return samples if found is None else found
 
 
-def _turned(change):
+def _candidates(solution, samples):
+    """The intervals in which distances may have fallen to zero, as far as the joints move in them."""
+    units = np.asarray(system_of(solution.mechanism, solution.q.dtype).units)
+    fastest = np.max(np.abs(samples.v / units), axis=1)
+    travelled = np.maximum(fastest[1:], fastest[:-1]) * np.diff(samples.ts)
+    smaller = np.minimum(samples.distances[1:], samples.distances[:-1])
+    return np.flatnonzero(smaller <= FASTEST * travelled)
+
+
+def _polished(solution, pair, time, q) -> _Found:
+    """A passage between two states, at the time and coordinates that a polynomial says, as the motion has it."""
+    begin, accuracy = pair.ts[0], pair.ts[1] - pair.ts[0]
+    if solution.repeat is None or not solution.repeat.has_parts:
+        return _Found(float(time), q, float(accuracy))
+    state, count = State(jnp.asarray(pair.q[0]), jnp.asarray(pair.v[0])), solution.repeat.num_intervals(solution)
+    for _ in range(POLISHES):
+        # The last two of the states that are saved evenly lie on both sides.
+        part = solution.repeat.part(solution, state, begin, begin + (time - begin) / (1.0 - 0.5 / count))
+        if result_name(part.result) not in ENDED_WELL:
+            break
+        ts, qs, vs = (np.asarray(of)[[0, -2, -1]] for of in (part.ts, part.q, part.v))
+        ends = [Samples(*(of[[0, k]][None] for of in (ts, qs, vs)), pair.distances[None]) for k in (1, 2)]
+        f, g = (_smallest(_between(solution, end, np.ones(1))[0])[0] for end in ends)
+        share = -f / (g - f) if g != f else 0.5
+        before, time, q = time, ts[1] + share * (ts[2] - ts[1]), qs[1] + share * (qs[2] - qs[1])
+        accuracy = abs(time - before)
+    return _Found(float(time), q, float(accuracy))
+
+
+def _eigenvalues(change, projector):
+    """Of a change of J, on the rows that are independent, onto which J times its right inverse projects.
+
+    Ones where a motion that diverged has left no numbers.
+    """
+    if not np.all(np.isfinite(change)):
+        return np.ones(len(change))
+    basis, _, _ = np.linalg.svd(projector)
+    basis = basis[:, : round(np.trace(projector))]
+    return np.linalg.eigvals(basis.T @ change @ basis)
+
+
+def _turned(values):
     """The eigenvalues that have become negative."""
-    values = _eigenvalues(change)
     return values.real[values.real < -np.abs(values.imag)]
 
 
-def _zeros(solution, intervals, ends):
-    """Where between saved states the eigenvalues are zero that end at `ends`, d and the coordinates there."""
+def _smallest(values):
+    """The eigenvalues next to zero, each of several."""
+    return np.array([each[np.argmin(np.abs(each))].real for each in values])
+
+
+def _zeros(solution, pairs, ends):
+    """Where between two states the eigenvalues are zero that end at `ends`, d and the coordinates there."""
     low, high = (np.zeros(len(ends)), np.ones(len(ends))), (np.ones(len(ends)), ends)
     places, distances = low
     states = np.zeros((len(ends), solution.q.shape[-1]))
     for _ in range(REFINEMENTS if len(ends) else 0):
         (a, f), (b, g) = low, high
         places = a + (b - a) * f / (f - g)
-        changes, distances, states = _between(solution, intervals, places)
-        values = [_eigenvalues(change).real for change in changes]
-        value = np.array([value[np.argmin(np.abs(value))] for value in values])
+        values, distances, states = _between(solution, pairs, places)
+        value = _smallest(values)
         low = np.where(value > 0.0, (places, value), low)
         high = np.where(value > 0.0, high, (places, value))
     return places, distances, states
 
 
-def _between(solution, intervals, places):
-    """What eigenvalues are taken of, d and q, at places from 0 to 1 between saved states."""
-    found = _between_states(solution, jnp.asarray(intervals), jnp.asarray(places))
-    return jax.tree.map(np.asarray, found)
+def _between(solution, pairs, places):
+    """Eigenvalues (see `_passages`), distances and coordinates, at places from 0 to 1 between two states."""
+    values, distances, states = [], [np.zeros(0)], [np.zeros((0, solution.q.shape[-1]))]
+    for first in range(0, len(places), BATCH):
+        taken = np.arange(first, min(first + BATCH, len(places)))
+        filled = np.resize(taken, BATCH)  # one shape, so that one program serves
+        given = (*pairs.taken(filled)[:3], places[filled])
+        found = between_states(solution.mechanism, solution.accuracy, solution.rank_nearby, *given)
+        change, projector, distance, q = (np.asarray(part)[: len(taken)] for part in found)
+        values += map(_eigenvalues, change, projector)
+        distances, states = [*distances, distance], [*states, q]
+    return values, np.concatenate(distances), np.concatenate(states)
 
 
 @runs_once
-def _between_states(solution, intervals, places):
-    dtype = solution.q.dtype
-    system, method = system_of(solution.mechanism, dtype), solution.accuracy.method(dtype, solution.rank_nearby)
+def between_states(mechanism, accuracy, rank_nearby, ts, qs, vs, places):
+    """J at places between two states, times its right inverse G at the first; J G there; d and q at the places.
 
-    def at(k, place):
-        duration = solution.ts[k + 1] - solution.ts[k]
+    All with a leading axis.
+    """
+    dtype = qs.dtype
+    system, method = system_of(mechanism, dtype), accuracy.method(dtype, rank_nearby)
+
+    def at(ts, qs, vs, place):
+        duration = ts[1] - ts[0]
         hermite = ThirdOrderHermitePolynomialInterpolation(
             t0=jnp.zeros((), dtype),
             t1=jnp.ones((), dtype),
-            y0=solution.q[k],
-            y1=solution.q[k + 1],
-            k0=duration * rates(system.topology, solution.q[k], solution.v[k]),
-            k1=duration * rates(system.topology, solution.q[k + 1], solution.v[k + 1]),
+            y0=qs[0],
+            y1=qs[1],
+            k0=duration * rates(system.topology, qs[0], vs[0]),
+            k1=duration * rates(system.topology, qs[1], vs[1]),
         )
-        t = solution.ts[k] + place * duration
         q = on_manifold(system.topology, hermite.evaluate(place))
-        here = method.crossing(system, t, q)
-        before = method.crossing(system, solution.ts[k], solution.q[k])
-        return here.jacobian @ before.inverse.normal, here.inverse.distance, q
+        here = method.crossing(system, ts[0] + place * duration, q)
+        before = method.crossing(system, ts[0], qs[0])
+        right_inverse = before.inverse.normal
+        return here.jacobian @ right_inverse, before.jacobian @ right_inverse, here.inverse.distance, q
 
-    return jax.vmap(at)(intervals, places)
+    return jax.vmap(at)(ts, qs, vs, places)

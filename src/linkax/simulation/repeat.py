@@ -15,6 +15,8 @@ from linkax.simulation.results import AccuracyWarning
 
 FINEST = 1e-13  # tolerance
 REFINED_STEPS = 4  # as many as in the run before
+DEFAULT_SAVES = 201
+FEWEST = 51  # saved times, with fewer of which a part is saved at the default ones
 
 
 class Repeat(eqx.Module):
@@ -26,35 +28,65 @@ class Repeat(eqx.Module):
 
     @staticmethod
     def of(simulate, *given) -> "Repeat":
-        """From `linkax.simulate`, and as it takes them: state, t0, dt0, solver, controller, max_steps, optimise."""
+        """From `linkax.simulate`, as it takes them: state, t0, dt0, solver, controller, max_steps, optimise.
+
+        Last, whether it saved states at given times and nothing else.
+        """
         return Repeat(simulate, *eqx.partition(given, lambda leaf: isinstance(leaf, jax.Array | np.ndarray)))
 
     def __call__(self, solution, factor):
         """A run at `factor` times its tolerances, or at half its steps, saved at the same times."""
-        state, t0, dt0, solver, controller, max_steps, optimise = eqx.combine(self.arrays, self.rest)
+        state, t0, dt0, solver, controller, max_steps, optimise, _ = eqx.combine(self.arrays, self.rest)
         accuracy = solution.accuracy
         if isinstance(MechanismControl(controller).innermost, diffrax.ConstantStepSize) and dt0 is not None:
             dt0 = 0.5 * dt0
         elif not MechanismControl(controller).is_adaptive:
             raise ValueError(f"steps of {type(controller).__name__} cannot be refined; use an adaptive controller")
         controller, accuracy = with_tolerances(lambda rtol: jnp.maximum(factor * rtol, FINEST), (controller, accuracy))
+        return self._run(
+            solution,
+            state,
+            t0=t0,
+            t1=solution.t_end,
+            accuracy=accuracy,
+            saveat=diffrax.SaveAt(ts=jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)),
+            solver=solver,
+            stepsize_controller=controller,
+            dt0=dt0,
+            max_steps=REFINED_STEPS * max_steps,
+            optimise=optimise,
+        )
+
+    def part(self, solution, state, t0, t1):
+        """The motion from a state at t0 to t1 with the same options, saved evenly: by the same program if it can be."""
+        _, _, dt0, solver, controller, max_steps, optimise, _ = eqx.combine(self.arrays, self.rest)
+        saveat = diffrax.SaveAt(ts=np.linspace(t0, t1, len(solution.ts))) if self._saves_enough(solution) else None
+        options = dict(solver=solver, stepsize_controller=controller, dt0=dt0, max_steps=max_steps, optimise=optimise)
+        return self._run(solution, state, t0=t0, t1=t1, accuracy=solution.accuracy, saveat=saveat, **options)
+
+    def num_intervals(self, solution) -> int:
+        """Between the states that a part saves."""
+        return (len(solution.ts) if self._saves_enough(solution) else DEFAULT_SAVES) - 1
+
+    def _saves_enough(self, solution):
+        return eqx.combine(self.arrays, self.rest)[-1] and len(solution.ts) >= FEWEST
+
+    @property
+    def start(self):
+        """State and time that the run began with."""
+        return eqx.combine(self.arrays, self.rest)[:2]
+
+    @property
+    def has_parts(self) -> bool:
+        """Whether a part of the motion can be run by itself: not where the steps themselves are given."""
+        controller = eqx.combine(self.arrays, self.rest)[4]
+        return not isinstance(MechanismControl(controller).innermost, diffrax.StepTo)
+
+    def _run(self, solution, state, **options):
+        formulation = solution.formulation
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AccuracyWarning)  # how far off a run is, this one is to tell
-            return self.simulate(
-                solution.mechanism,
-                state,
-                t0=t0,
-                t1=solution.t_end,
-                accuracy=accuracy,
-                formulation=solution.formulation,
-                saveat=diffrax.SaveAt(ts=jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)),
-                solver=solver,
-                stepsize_controller=controller,
-                dt0=dt0,
-                max_steps=REFINED_STEPS * max_steps,
-                optimise=optimise,
-                throw=False,
-            )
+            return self.simulate(solution.mechanism, state, formulation=formulation, throw=False, **options)
 
 
 def with_tolerances(change, tree):

@@ -128,6 +128,7 @@ def _joined(parts) -> Solution:
         stats=parts[-1].stats | counted,
         rank_nearby=np.max([part.rank_nearby for part in parts], axis=0),
         closest=min(part.closest for part in parts),
+        repeat=parts[0].repeat,
     )
 
 

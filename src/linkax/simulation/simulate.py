@@ -29,7 +29,7 @@ from linkax.simulation.options import (
     traced_tolerances,
 )
 from linkax.simulation.outset import Outset, depart
-from linkax.simulation.repeat import Repeat
+from linkax.simulation.repeat import DEFAULT_SAVES, Repeat
 from linkax.simulation.replay import Course, Steps, integrate, is_replayable
 from linkax.simulation.results import ENDED_WELL, RESULTS, AccuracyWarning, SimulationError, result_name
 from linkax.simulation.rows import over_rows
@@ -38,7 +38,6 @@ from linkax.simulation.state import State
 from linkax.simulation.undefined import undefined_where
 from linkax.tracing import all_known, compiled, runs_once
 
-DEFAULT_SAVES = 201
 DEFAULT_MAX_STEPS = 16**4
 _SAVE_STATE = diffrax.SubSaveAt(t1=True).fn
 
@@ -171,7 +170,9 @@ def simulate(
         rank_nearby=outset.rank,
         closest=found.closest,
         interpolation=found.interpolation,
-        repeat=Repeat.of(simulate, state, t0, dt0, solver, stepsize_controller, max_steps, optimise),
+        repeat=Repeat.of(
+            simulate, state, t0, dt0, solver, stepsize_controller, max_steps, optimise, _saves_times(saveat)
+        ),
     )
     if all_known((found, end, saved)):
         rtol, _ = control.tolerances((accuracy.rtol, None))
@@ -245,6 +246,11 @@ def _problem(mechanism, accuracy, outset, formulation) -> Problem:
 def _saves_states(saveat) -> bool:
     """Whether states are saved, and not functions of them."""
     return saveat is None or (isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is _SAVE_STATE)
+
+
+def _saves_times(saveat) -> bool:
+    """Whether states are saved at given times, and nothing else."""
+    return jax.tree.structure(saveat) == jax.tree.structure(diffrax.SaveAt(ts=np.zeros(1)))
 
 
 class _Found(NamedTuple):
