@@ -117,7 +117,7 @@ def test_an_unknown_name_names_the_known_ones(name):
 
 
 def test_bad_numbers_name_the_element():
-    with pytest.raises(ValueError, match=r"alpha of Baumgarte \[1/s\] is -1; it must be zero or more"):
+    with pytest.raises(ValueError, match=r"alpha of Baumgarte \[1/s\] is -1.0; it must be zero or more"):
         lx.Baumgarte(-1)
     with pytest.raises(ValueError, match=r"tolerance of MoorePenrose is nan; it must be finite"):
         lx.MoorePenrose(tolerance=np.nan)

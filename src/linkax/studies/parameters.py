@@ -86,10 +86,10 @@ class PhysicalInertia(AbstractParameter):
     def __init__(self, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(1.0, 1.0, 1.0)):
         mass = number(mass, (), "PhysicalInertia: mass [kg]")
         center_of_mass = number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]")
-        inertia = inertia_tensor(inertia, "PhysicalInertia: inertia [kg m²]")
+        given, inertia = inertia, inertia_tensor(inertia, "PhysicalInertia: inertia [kg m²]")
         smallest = _least(_pseudo_inertia(mass, center_of_mass, inertia))
         remedy = (
-            f"no body with extent along all axes has it and inertia {inertia} kg m²; all principal moments must be "
+            f"no body with extent along all axes has it and inertia {given} kg m²; all principal moments must be "
             "positive, and each smaller than the sum of the other two"
         )
         mass = require(mass, lambda _: smallest > 0.0, "PhysicalInertia: mass [kg]", remedy)
