@@ -453,8 +453,6 @@ def _readings(numbers):
     return run.q, run.v, *found, of(lx.RESULTS.successful), of(lx.RESULTS.not_finite), finite
 
 
-# Fails with "no registered implementation" of a call of XLA, for a cause not found yet; so not in the quick run.
-@pytest.mark.slow
 def test_a_member_with_numbers_that_cannot_be_is_marked_and_changes_no_other():
     count = len(POSSIBLE) + 2
     right = {name: np.full(count, value) for name, value in POSSIBLE.items()}

@@ -66,8 +66,6 @@ def test_derivatives_agree_with_differences(name):
     np.testing.assert_allclose(relative[:, closes], differences[:, closes], atol=1e-6)
 
 
-# Fails with "no registered implementation" of a call of XLA, for a cause not found yet; so not in the quick run.
-@pytest.mark.slow
 def test_fit_of_a_mass_alone():
     """That no loop depends on, with the state assembled inside of the residual."""
 

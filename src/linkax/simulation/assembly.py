@@ -26,8 +26,7 @@ MOST_STEPS = 100
 LONGEST_STEP = 0.7  # radians, or lengths of the mechanism
 STEP_FRACTIONS = 0.5 ** np.arange(6)
 SMALL = 1e-15
-MOST_TURNS = 60  # of Newton's method for speeds: from close to where y² = x² is flat, each but halves the way
-TURNED = 1e-13  # last turn, relative to the speeds asked
+TURNS = 30  # of Newton's method for speeds: from close to where y² = x² is flat, each but halves the way
 BESIDE = 1e-2
 CLOSED = 1e-9  # remaining gap, relative to the mechanism's length
 # Starts of the search beside the guess, by which it leaves a saddle of the gap, or a bad guess.
@@ -276,15 +275,9 @@ def _on_branch(asked, v):
     """Speeds on a branch, by Newton steps from a little beside speeds v, which may lie just between two."""
     beside = BESIDE * jnp.sum(asked.crossing.inverse.basis, axis=1)
     off = asked.off_branch(v) > ON_BRANCH * BALANCED.method(v.dtype).rank_tolerance
-
-    def turn(carry):
-        count, v, _ = carry
-        change = _nearest(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
-        return count + 1, v + change, asked.crossing.fastest(change)
-
-    unfinished = lambda carry: (carry[0] < MOST_TURNS) & (carry[2] > TURNED)
-    begin = jnp.zeros((), int), v + jnp.where(off, beside, 0.0), jnp.asarray(jnp.inf, v.dtype)
-    return lax.while_loop(unfinished, turn, begin)[1]
+    turn = lambda _, v: v + _nearest(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
+    # As many each time: with a loop that ends sooner XLA (jaxlib 0.10) finds no callbacks in the rest of the program.
+    return lax.fori_loop(0, TURNS, turn, v + jnp.where(off, beside, 0.0))
 
 
 @_on_branch.def_jvp
