@@ -30,6 +30,19 @@ def kernels():
     return {name: np.asarray(array).tolist() for name, array in told.items()} | {"loops": loop.count("while")}
 
 
+def assembled_inside(angle):
+    """The same end of a pendulum's motion, assembled and run in one program, and in programs of their own."""
+
+    def end(angle):
+        arm = lx.rod("arm", 1.0, 1.0)
+        hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")
+        mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -9.81, 0.0])])
+        return lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": angle}), t1=0.5).q[-1, 0]
+
+    return [float(end(angle)), float(jax.jit(end)(angle))]
+
+
 if __name__ == "__main__":
     motions = {"motion": motion(), "motion_once": motion(optimise=False)}
-    print(json.dumps({"makes_kernels": makes_kernels_of_loops(), **motions, "kernels": kernels()}))
+    told = {"makes_kernels": makes_kernels_of_loops(), "kernels": kernels(), "assembled_inside": assembled_inside(0.4)}
+    print(json.dumps(told | motions))

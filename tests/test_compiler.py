@@ -17,7 +17,8 @@ from linkax.tracing import runs_once
 
 @pytest.fixture(scope="module")
 def as_users_do():
-    environment = {name: text for name, text in os.environ.items() if name != "XLA_FLAGS"}
+    of_tests = ("XLA_FLAGS", "EQX_ON_ERROR")
+    environment = {name: text for name, text in os.environ.items() if name not in of_tests}
     program = Path(__file__).with_name("compiled_as_users_do.py")
     done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
@@ -34,6 +35,12 @@ def test_how_a_run_is_compiled_changes_nothing_but_rounding(as_users_do, compile
     one, other = as_users_do[compiled], motion()
     assert one["steps"] == other["steps"]
     np.testing.assert_allclose(one["speeds"], other["speeds"], rtol=1e-10)
+
+
+def test_assembly_may_be_part_of_a_program_with_callbacks(as_users_do):
+    """Errors of Equinox call back to Python, which XLA finds no way to from some programs with loops."""
+    apart, together = as_users_do["assembled_inside"]
+    np.testing.assert_allclose(together, apart, rtol=1e-10)
 
 
 def test_a_function_in_a_kernel_is_the_same_function(as_users_do):
