@@ -47,11 +47,16 @@ def runs_once(function):
     return wraps(function)(partial(compiled(function), once=True))
 
 
+def materialised(primal, change):
+    """A change as an array: of zeros, where None stands for none."""
+    return jnp.zeros_like(primal) if change is None else change
+
+
 def pushed_forward(function, primals, changes):
     """Value and change of a function, like `equinox.filter_jvp`, which gives None for no change; this gives zeros."""
     found, change = eqx.filter_jvp(function, primals, changes)
     numbers, _ = eqx.partition(found, eqx.is_inexact_array)
-    return found, jax.tree.map(lambda of, to: jnp.zeros_like(of) if to is None else to, numbers, change)
+    return found, jax.tree.map(materialised, numbers, change)
 
 
 def in_one_kernel(function, sound, *args):

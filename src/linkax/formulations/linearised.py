@@ -18,7 +18,7 @@ from linkax.equations.dynamics import unbalanced_force
 from linkax.equations.loops import gamma, jacobian, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
-from linkax.tracing import pushed_forward
+from linkax.tracing import materialised, pushed_forward
 
 
 class Changes(NamedTuple):
@@ -53,7 +53,7 @@ def moved(onto: Callable | None, system: System, t, q, v, changes: Changes) -> M
     """
     topology = system.topology
     along = jnp.zeros_like(v) if changes.q is None else speeds(topology, q, changes.q)
-    to_v = jnp.zeros_like(v) if changes.v is None else changes.v
+    to_v = materialised(v, changes.v)
     if onto is not None:
         open_ = lambda system, t, q: residual(configure(system, t, q))
         to_q = rates(topology, q, along)

@@ -20,7 +20,7 @@ from linkax.simulation.given import Given, by_joint, check_mechanism, checked_ti
 from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
-from linkax.tracing import all_known, pushed_forward, runs_once
+from linkax.tracing import all_known, materialised, pushed_forward, runs_once
 
 MOST_STEPS = 100
 LONGEST_STEP = 0.7  # radians, or lengths of the mechanism
@@ -286,7 +286,7 @@ def _on_branch_jvp(primals, changes):
     (asked, begin), (change, begins) = primals, changes
     v = _on_branch(asked, begin)
     opens = pushed_forward(lambda asked: asked.rest(v), (asked,), (change,))[1]
-    return v, _nearest(asked.system, jnp.zeros_like(v) if begins is None else begins, asked.slopes(v), opens)
+    return v, _nearest(asked.system, materialised(v, begins), asked.slopes(v), opens)
 
 
 def _speeds(configuration, held):

@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from linkax.simulation.integration import Problem, Projected
+from linkax.tracing import materialised
 
 NO_REVERSE = (
     "Reverse-mode derivatives of reverse-mode derivatives of a simulation do not exist. Take second derivatives "
@@ -160,7 +161,7 @@ def _forwards(solver, every, course, steps, restored, flat) -> Motion:
     """Tangents, step by step."""
     changes = restored(flat)
     saved, y0, last = course.saved, course.y0, steps.count - 1
-    saved_dot = None if saved is None else _zero(saved, changes.saved)
+    saved_dot = None if saved is None else materialised(saved, changes.saved)
 
     def step(problem, t0, t1, y):
         return _step(solver, problem, t0, t1, y)
@@ -168,8 +169,8 @@ def _forwards(solver, every, course, steps, restored, flat) -> Motion:
     def one(carry):
         k, j, y, motion = carry
         ends = steps.ts[k], steps.ts[k + 1]
-        begin_dot = jnp.where(k == 0, _zero(course.t0, changes.t0), 0.0)
-        end_dot = jnp.where(k == last, _zero(course.t1, changes.t1), 0.0)
+        begin_dot = jnp.where(k == 0, materialised(course.t0, changes.t0), 0.0)
+        end_dot = jnp.where(k == last, materialised(course.t1, changes.t1), 0.0)
         moved = changes.problem, begin_dot, end_dot, motion.end
         (y, dense), (y_dot, dense_dot) = eqx.filter_jvp(step, (course.problem, *ends, y), moved)
 
@@ -186,8 +187,8 @@ def _forwards(solver, every, course, steps, restored, flat) -> Motion:
 
     motion = Motion(
         saved=None if saved is None else jnp.zeros((len(saved), len(y0)), y0.dtype),
-        end=_zero(y0, changes.y0),
-        steps=jnp.zeros_like(steps.ys).at[0].set(_zero(y0, changes.y0)) if every else None,
+        end=materialised(y0, changes.y0),
+        steps=jnp.zeros_like(steps.ys).at[0].set(materialised(y0, changes.y0)) if every else None,
     )
     begin = jnp.zeros((), int), jnp.zeros((), int), y0, motion
     return lax.while_loop(lambda carry: carry[0] < steps.count, one, begin)[-1]
@@ -269,25 +270,20 @@ def _tracked_jvp(primals, changes):
     (course, integration), (changes, _) = primals, changes
     found, steps = _tracked(course, integration)
     motion = tangents(integration.solver, course, steps, changes, every=True)
-    begin, end = _zero(course.t0, changes.t0), _zero(course.t1, changes.t1)
+    begin, end = materialised(course.t0, changes.t0), materialised(course.t1, changes.t1)
     ts = jnp.zeros_like(steps.ts).at[steps.count].set(end).at[0].set(begin)
     return (found, steps), (_change(found, integration, course, changes, motion), Steps(ts, motion.steps, None))
-
-
-def _zero(primal, change):
-    """A change, as an array where there is none."""
-    return jnp.zeros_like(primal) if change is None else change
 
 
 def _change(found, integration, course, changes, motion):
     """Of what is found: the end's time is t1, unless the integration ended before."""
     nothing = jax.tree.map(lambda _: None, found)
-    begin, end = _zero(course.t0, changes.t0), _zero(course.t1, changes.t1)
-    saved = None if course.saved is None else _zero(course.saved, changes.saved)
+    begin, end = materialised(course.t0, changes.t0), materialised(course.t1, changes.t1)
+    saved = None if course.saved is None else materialised(course.saved, changes.saved)
     return nothing._replace(
         ts=integration.rows(begin, saved, end),
         t_end=jnp.where(found.t_end == course.t1, end, 0.0),
-        ys=integration.rows(_zero(course.y0, changes.y0), motion.saved, motion.end),
+        ys=integration.rows(materialised(course.y0, changes.y0), motion.saved, motion.end),
         y_end=motion.end,
     )
 

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from linkax.tracing import materialised
+
 
 @eqx.filter_custom_jvp
 def undefined_where(undefined, values, inputs):
@@ -26,7 +28,6 @@ def undefined_where(undefined, values, inputs):
 @undefined_where.def_jvp
 def _undefined_where_jvp(primals, changes):
     (undefined, values, _), (_, to_values, to_inputs) = primals, changes
-    materialised = lambda of, to: jnp.zeros_like(of) if to is None else to
     to_values, restored = ravel_pytree(jax.tree.map(materialised, values, to_values))
     undefined, _ = ravel_pytree(jax.tree.map(lambda none, of: jnp.broadcast_to(none, of.shape), undefined, values))
     # What all inputs have in common: through it their cotangents are reached. Of a batch, all of it is one.
