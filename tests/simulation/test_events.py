@@ -32,7 +32,9 @@ def driven(length, **options):
         lx.Revolute("wrist_pin", rod.at("tip"), slider, axis="z"),
         lx.Prismatic("guide", lx.GROUND, slider, axis="x"),
     ]
-    mechanism = lx.Mechanism([crank, rod, slider], joints, constraints=[lx.Drive("motor", "bearing", 0.5, 1.0)])
+    mechanism = lx.Mechanism(
+        [crank, rod, slider], joints, constraints=[lx.Drive("motor", "bearing", lambda t: 0.5 + t)]
+    )
     return lx.simulate(mechanism, lx.assemble(mechanism), accuracy=FINE, **options)
 
 
