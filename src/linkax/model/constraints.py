@@ -95,8 +95,8 @@ class Drive(LinearConstraint):
 
     - `name`: unique among joints and constraints.
     - `joint`: a joint's name, or (name, index) for one of several coordinates, counted like speeds.
-    - `motion`: t [s] ↦ coordinate [rad or m], twice differentiable by JAX. Numbers to be traced
-      go in by `jax.tree_util.Partial(function, numbers)` or an `equinox.Module`.
+    - `motion`: t [s] ↦ coordinate [rad or m], twice differentiable by JAX. JAX arrays that it
+      closes over are traced; all else that it reads is structure, and is not to change later.
 
     **Raises:** `ValueError` for a function that does not return one number.
     """

@@ -133,8 +133,7 @@ class JointTorque(_AlongJoint):
 
     - `joint`: a joint's name, or (name, index) for one of several speeds.
     - `torque`: a number, or a function (t, motion) ↦ number; what `motion` tells is in
-      `linkax.Motion`. Numbers of the function to be traced go in by
-      `jax.tree_util.Partial(function, numbers)` or an `equinox.Module`.
+      `linkax.Motion`. What the function reads is as for `linkax.Drive`.
     """
 
     torque: Float[Array, ""] | Law

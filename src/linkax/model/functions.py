@@ -3,40 +3,52 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from linkax.model.code import Code
 from linkax.model.numbers import converted, number
 
 
-class Law(eqx.Module):
-    """A user's function as part of a mechanism: its numbers are traced, the rest is structure.
+class Function(eqx.Module):
+    """A user's function as a pytree: its numbers are leaves, the rest is structure (see `Code`).
 
-    Numbers are the arrays and floats in a function that is a pytree: an `equinox.Module`, or
-    `jax.tree_util.Partial(function, numbers)`. A plain function is structure as a whole, so that
-    another one, of the same text too, compiles anew.
+    Both are those of the moment when this is made.
     """
 
     numbers: tuple[Array, ...]
-    structure: tuple = eqx.field(static=True)
+    code: Code = eqx.field(static=True)
+
+    def __init__(self, function: Callable):
+        self.code, self.numbers = Code.of(function)
+
+    def __call__(self, *arguments):
+        return self.code.with_numbers(self.numbers)(*arguments)
+
+
+class Law(eqx.Module):
+    """A user's function as part of a mechanism; `what` names it in errors."""
+
+    function: Function
     shape: tuple[int, ...] = eqx.field(static=True)
     what: str = eqx.field(static=True)
 
     def __init__(self, function: Callable, shape, what: str):
-        leaves, tree = jax.tree.flatten(function)
-        is_number = [eqx.is_array(leaf) or isinstance(leaf, float) for leaf in leaves]
-        self.numbers = tuple(jnp.asarray(leaf) for leaf, traced in zip(leaves, is_number, strict=True) if traced)
-        rest = tuple(None if traced else leaf for leaf, traced in zip(leaves, is_number, strict=True))
-        self.structure = (tree, tuple(is_number), rest)
-        self.shape, self.what = shape, what
+        self.function, self.shape, self.what = Function(function), shape, what
+
+    def check(self):
+        """Whether what the function reads is what it was when the mechanism was built."""
+        if self.function.code.has_changed():
+            variables = ", ".join(self.function.code.variables)
+            raise ValueError(
+                f"{self.what}: what its function reads ({variables}) has changed since the mechanism was built; "
+                "build the mechanism anew"
+            )
 
     def __call__(self, *arguments):
-        tree, is_number, rest = self.structure
-        numbers = iter(self.numbers)
-        leaves = [next(numbers) if traced else leaf for traced, leaf in zip(is_number, rest, strict=True)]
+        self.check()
         try:
-            found = jax.tree.unflatten(tree, leaves)(*arguments)
+            found = self.function(*arguments)
         except Exception as error:
             raise ValueError(f"{self.what}: its function raises {raised(error)}") from error
         found = converted(found, f"{self.what}: what its function returns", jnp.asarray)

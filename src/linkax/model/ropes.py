@@ -63,8 +63,8 @@ class Rope(AbstractConstraint):
 
     - `name`: unique among joints and constraints.
     - `points`: two or more bodies (their reference frames), `body.at(...)`, or `lx.GROUND.at(...)`, in order.
-    - `length`: [m], a number, or a function of time t [s], twice differentiable: a winch, or a driven cylinder. Numbers
-      of the function to be traced go in by `jax.tree_util.Partial(function, numbers)` or an `equinox.Module`.
+    - `length`: [m], a number, or a function of time t [s], twice differentiable: a winch, or a driven cylinder. What
+      the function reads is as for `Drive`.
 
     **Raises:** `ValueError` for fewer than two points, all of them on one body, or a length that is not positive.
     """

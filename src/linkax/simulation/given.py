@@ -35,14 +35,20 @@ class Given(eqx.Module):
         return [of_joint(along) if along.index is None else of_joint(along)[along.index][None] for along in self.terms]
 
 
+def _is_law(node) -> bool:
+    return isinstance(node, Law)
+
+
 def check_mechanism(mechanism):
-    """Whether this is one mechanism, and JAX is in double precision."""
+    """Whether this is one mechanism, its functions are still the same, and JAX is in double precision."""
     if not jax.config.jax_enable_x64:
         raise ValueError(
             "jax_enable_x64 is False, switched off after linkax was imported; switch it on again by "
             'jax.config.update("jax_enable_x64", True), and for a run in single precision give dtype=jnp.float32'
         )
     instance(mechanism, Mechanism, "mechanism", "give a linkax.Mechanism, such as your function of parameters returns")
+    for law in filter(_is_law, jax.tree.leaves((mechanism.forces, mechanism.constraints), is_leaf=_is_law)):
+        law.check()
     for body in mechanism.bodies:
         if np.shape(body.mass) != ():
             raise ValueError(
@@ -63,7 +69,7 @@ def sound_numbers(mechanism) -> Bool[Array, ""] | np.bool_:
     """
     places = (mechanism.bodies, mechanism.beams, mechanism.joints, mechanism.forces, mechanism.constraints)
     own = [element for element in chain(*places) if type(element).__module__.startswith("linkax.")]
-    leaves = jax.tree.leaves(own, is_leaf=lambda node: isinstance(node, Law))
+    leaves = jax.tree.leaves(own, is_leaf=_is_law)
     # An array of NumPy was known when the mechanism was built, and checked there.
     return reduce(and_, map(is_finite, filter(eqx.is_array, leaves)), np.True_)
 

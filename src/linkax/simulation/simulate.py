@@ -14,6 +14,7 @@ from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import formulation as named_formulation
 from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.functions import Function
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import flag, instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
@@ -127,6 +128,7 @@ def simulate(
     replayed = adjoint is None and _saves_states(saveat) and is_replayable(solver, saveat, event, max_steps)
     if adjoint is None:
         adjoint = diffrax.ForwardMode() if replayed else diffrax.RecursiveCheckpointAdjoint()
+    saveat, event = _with_functions(saveat, event)
     control = MechanismControl(traced_tolerances(stepsize_controller), is_final=replayed)
     once = not optimise and not mechanism.beams  # whose large arrays take as long to compile either way
     mechanism, state, t0, accuracy = _cast((mechanism, state, t0, accuracy), dtype)
@@ -196,6 +198,23 @@ def fixed_steps(step: float | None, t1: float) -> dict:
         return {}
     most = max(DEFAULT_MAX_STEPS, int(2.0 * t1 / step))
     return {"dt0": step, "stepsize_controller": diffrax.ConstantStepSize(), "max_steps": most}
+
+
+def _with_functions(saveat, event):
+    """The same with their functions compared by what they compute, see `linkax.model.code`."""
+    if event is not None:
+        functions = jax.tree.map(Function, event.cond_fn, is_leaf=callable)
+        event = eqx.tree_at(lambda e: e.cond_fn, event, functions)
+    if not _saves_states(saveat):
+        is_sub = lambda node: isinstance(node, diffrax.SubSaveAt)
+        saveat = eqx.tree_at(lambda s: s.subs, saveat, jax.tree.map(_with_function, saveat.subs, is_leaf=is_sub))
+    return saveat, event
+
+
+def _with_function(sub):
+    if sub.fn is _SAVE_STATE or (function := Function(sub.fn)).numbers:  # which diffrax takes for structure
+        return sub
+    return eqx.tree_at(lambda s: s.fn, sub, function)
 
 
 class _OnManifold(eqx.Module):

@@ -1,0 +1,225 @@
+"""Functions compared by what they compute: the same made anew, others where anything that they read is another."""
+
+import functools
+import math
+import types
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from linkax.model.code import Code
+
+SPEED, TABLE, NUMBERS = 2.0, {"speed": [2.0, 3.0]}, np.arange(3.0)
+settings = types.ModuleType("settings")  # as of a file of the user
+settings.speed, settings.other = 2.0, object()
+
+
+def at_speed(t):
+    return SPEED * t
+
+
+class Motor:
+    gear = 3.0
+
+    def __init__(self, speed):
+        self.speed, self.last = speed, None
+
+    def turn(self, t):
+        return self.gear * self.speed * at_speed(t)
+
+    def __call__(self, t):
+        return self.turn(t)
+
+    @property
+    def twice(self):
+        return 2.0 * self.speed
+
+
+class Wave(eqx.Module):
+    size: jax.Array
+    law: types.FunctionType = eqx.field(default=jnp.sin)
+
+    def __call__(self, t):
+        return self.size * self.law(t)
+
+    def doubled(self, t):
+        return 2.0 * self(t)
+
+
+def scaled(factor):
+    def outer(t):
+        inner = lambda t: factor * t
+        return inner(t)
+
+    return outer
+
+
+def deep(values):
+    law, other = lambda t: values["of"][0] * t, scaled(values["by"])
+    return lambda t, also=other: law(t) + also(t)
+
+
+def reading_an_attribute(name):
+    return lambda t: getattr(settings, name) * t
+
+
+def of_itself():
+    def law(t, depth=2):
+        return t if depth == 0 else law(t, depth - 1)
+
+    return law
+
+
+def counting():
+    count = 0
+
+    def law(t):
+        nonlocal count
+        count += 1
+        return t
+
+    return law
+
+
+MADE = {
+    "no variables": lambda: lambda t: 2.0 * jnp.sin(math.pi * t),
+    "a number": lambda: scaled(2.0),
+    "text and None": lambda: (lambda word, none: lambda t: t if word == "x" and none is None else 0.0)("x", None),
+    "an array of NumPy": lambda: scaled(np.arange(3.0)),
+    "containers and functions": lambda: deep({"of": [2.0, (1, 2)], "by": 3.0}),
+    "defaults": lambda: lambda t, k=2.0, *, other=(3.0,): k * other[0] * t,
+    "globals": lambda: lambda t: at_speed(t) + TABLE["speed"][0] + NUMBERS[1],
+    "a module": lambda: lambda t: settings.speed * t,
+    "a partial": lambda: functools.partial(scaled(2.0)),
+    "a partial of JAX": lambda: jax.tree_util.Partial(lambda k, t: k * t, 2.0),
+    "a method": lambda: Motor(2.0).turn,
+    "something to call": lambda: Motor(2.0),
+    "attributes": lambda: (lambda motor: lambda t: motor.twice * t)(Motor(2.0)),
+    "a method of a pytree": lambda: Wave(jnp.array(2.0)).doubled,
+    "a pytree": lambda: Wave(jnp.array(2.0), lambda t: t**2),
+    "a function of JAX": lambda: jnp.sin,
+}
+
+
+@pytest.mark.parametrize("made", MADE.values(), ids=MADE)
+def test_a_function_made_anew_is_the_same(made):
+    (one, numbers), (other, others) = Code.of(made()), Code.of(made())
+    assert one == other
+    assert hash(one) == hash(other)
+    assert not one.has_changed()
+    np.testing.assert_array_equal(one.with_numbers(numbers)(0.3), made()(0.3))
+    assert len(numbers) == len(others)
+
+
+UNLIKE = {
+    "numbers": (scaled(2.0), scaled(3.0)),
+    "a whole number": (scaled(2), scaled(2.0)),
+    "zeros of unlike sign": (scaled(0.0), scaled(-0.0)),
+    "true and one": (scaled(True), scaled(1)),
+    "types of arrays": (scaled(np.arange(3)), scaled(np.arange(3.0))),
+    "shapes": (scaled(np.zeros((2, 1))), scaled(np.zeros((1, 2)))),
+    "code": (lambda t: t + 1.0, lambda t: t + 2.0),
+    "constants of unlike type": (lambda t: t * 1, lambda t: t * 1.0),
+    "order of entries": (deep({"of": [1.0], "by": 1.0}), deep({"by": 1.0, "of": [1.0]})),
+    "defaults": (functools.partial(MADE["defaults"]()), functools.partial(MADE["defaults"](), 3.0)),
+    "an array for a number": (scaled(2.0), scaled(jnp.array(2.0))),
+    "attributes": (Motor(2.0).turn, Motor(3.0).turn),
+    "functions in pytrees": (Wave(jnp.array(2.0), lambda t: t), Wave(jnp.array(2.0), lambda t: -t)),
+}
+
+
+@pytest.mark.parametrize("pair", UNLIKE.values(), ids=UNLIKE)
+def test_functions_that_differ_are_not_the_same(pair):
+    one, other = (Code.of(function)[0] for function in pair)
+    assert one != other
+
+
+UNDECIDED = {
+    "names made when it runs": lambda: reading_an_attribute("speed"),
+    "a function of itself": of_itself,
+    "a variable that it changes": counting,
+    "an object of unknown kind": lambda: scaled(object()),
+    "a program of JAX": lambda: scaled(jax.jit(lambda t: t)),
+    "too much": lambda: scaled([0.0] * 20_000),
+}
+
+
+@pytest.mark.parametrize("made", UNDECIDED.values(), ids=UNDECIDED)
+def test_what_cannot_be_decided_is_the_same_as_itself_alone(made):
+    function = made()
+    code, _ = Code.of(function)
+    assert code == Code.of(function)[0]
+    assert code != Code.of(made())[0]
+    assert code.with_numbers(()) is function
+
+
+def _closed_over(change):
+    values = {"of": [2.0], "by": 3.0}
+    return deep(values), lambda _: change(values)
+
+
+ARRAY, MOTOR = np.arange(3.0), Motor(2.0)
+CHANGES = {
+    "an entry of a dictionary": _closed_over(lambda values: values.update(by=4.0)),
+    "an entry of a list": _closed_over(lambda values: values["of"].append(1.0)),
+    "a number for an array": _closed_over(lambda values: values.update(by=jnp.array(3.0))),
+    "entries of an array": (scaled(ARRAY), lambda _: ARRAY.__setitem__(0, 1.0)),
+    "a global": (MADE["globals"](), lambda patch: patch.setitem(globals(), "SPEED", 3.0)),
+    "an entry of a global": (MADE["globals"](), lambda patch: patch.setitem(TABLE, "speed", [3.0])),
+    "a function that it calls": (MADE["globals"](), lambda patch: patch.setitem(globals(), "at_speed", abs)),
+    "an attribute of a module": (MADE["a module"](), lambda patch: patch.setattr(settings, "speed", 3.0)),
+    "an attribute": (MOTOR.turn, lambda patch: patch.setattr(MOTOR, "speed", 3.0)),
+    "an attribute of a class": (Motor(1.0), lambda patch: patch.setattr(Motor, "gear", 1.0)),
+    "a global that a method reads": (Motor(4.0).turn, lambda patch: patch.setitem(globals(), "SPEED", 3.0)),
+}
+
+
+@pytest.mark.parametrize(("function", "change"), CHANGES.values(), ids=CHANGES)
+def test_changes_of_what_a_function_reads_are_seen(function, change, monkeypatch):
+    code, _ = Code.of(function)
+    assert not code.has_changed()
+    change(monkeypatch)
+    assert code.has_changed()
+    assert code != Code.of(function)[0]
+
+
+def test_another_array_in_place_of_one_is_seen():
+    values = {"of": [2.0], "by": jnp.array(3.0)}
+    code, _ = Code.of(deep(values))
+    values["by"] = jnp.array(4.0)
+    assert code.has_changed()
+
+
+def test_what_code_does_not_name_may_change():
+    motor = Motor(2.0)
+    code, _ = Code.of(motor.turn)
+    motor.last, settings.other = object(), None
+    assert not code.has_changed()
+
+
+OF_ARRAY = {
+    "closed over": scaled,
+    "in containers": lambda x: deep({"of": [x], "by": x}),
+    "default": lambda x: lambda t, k=x: k * t,
+    "of a partial": lambda x: functools.partial(lambda k, t: k * t, x),
+    "of a partial of JAX": lambda x: jax.tree_util.Partial(lambda k, t: k * t, x),
+    "of a pytree": lambda x: Wave(x),
+    "of a pytree that is closed over": lambda x: lambda t: Wave(x).doubled(t),
+    "of a method": lambda x: Wave(x).doubled,
+}
+
+
+@pytest.mark.parametrize("of", OF_ARRAY.values(), ids=OF_ARRAY)
+def test_arrays_are_numbers_of_a_function(of):
+    one, other = jnp.array([2.0, 3.0]), jnp.array([4.0, 5.0])
+    (code, numbers), (again, _) = Code.of(of(one)), Code.of(of(other))
+    assert code == again
+    assert all(number is one for number in numbers)
+    np.testing.assert_array_equal(code.with_numbers([other] * len(numbers))(0.3), of(other)(0.3))
+    through = jax.jacfwd(lambda x: code.with_numbers([x] * len(numbers))(0.3))
+    np.testing.assert_array_equal(through(one), jax.jacfwd(lambda x: of(x)(0.3))(one))
+    traced = jax.jacfwd(lambda x: (found := Code.of(of(x)))[0].with_numbers(found[1])(0.3))
+    np.testing.assert_array_equal(traced(one), jax.jacfwd(lambda x: of(x)(0.3))(one))

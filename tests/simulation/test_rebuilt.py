@@ -1,0 +1,109 @@
+"""Mechanisms built again and again, with functions in them that are made anew each time."""
+
+from contextlib import contextmanager
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+from linkax.compiler import COMPILING
+
+
+@contextmanager
+def compilations():
+    """How many programs XLA compiles meanwhile."""
+    names = []
+    note = lambda event, _, **what: names.append(what) if event == COMPILING else None
+    jax.monitoring.register_event_duration_secs_listener(note)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(note)
+
+
+HINGE = ("hinge", lx.GROUND)
+
+
+def turned(numbers):
+    """Angle of a rotor of inertia one after a second, by functions of these numbers."""
+    rotor = lx.RigidBody("rotor", 1.0, [0.0, 0.0, 0.0], jnp.ones(3))
+    torque, moment, force = numbers
+    forces = [
+        lx.JointTorque("hinge", lambda t, motion: torque * t),
+        lx.PointMoment(rotor, lambda t, motion: jnp.array([0.0, 0.0, moment])),
+        lx.PointForce(rotor.at([1.0, 0.0, 0.0]), lambda t, motion: jnp.array([0.0, force, 0.0]), axes="frame"),
+    ]
+    mechanism = lx.Mechanism([rotor], [lx.Revolute(*HINGE, rotor, "z")], forces)
+    event = diffrax.Event(lambda t, state, mechanism: state.q[0] - 100.0 * torque)
+    saveat = diffrax.SaveAt(t1=True, fn=lambda t, state, mechanism: state.q[0])
+    start = lx.State(jnp.zeros(1), jnp.zeros(1))
+    found = lx.simulate(mechanism, start, t1=1.0, saveat=saveat, event=event, optimise=False)
+    return found.ys[-1]
+
+
+def moved(numbers):
+    """Coordinates and speeds of a driven arm and of a load on a winch, at 0.1 s, by functions of these numbers."""
+    arm, load = lx.rod("arm", 1.0, 1.0), lx.point_mass("load", 1.0)
+    joints = [lx.Revolute(*HINGE, arm.at("base"), "z"), lx.Prismatic("lift", lx.GROUND, load, "y")]
+    constraints = [
+        lx.Drive("motor", "hinge", lambda t: numbers[0] * jnp.sin(numbers[1] * t)),
+        lx.Rope("winch", [lx.GROUND.at([0.0, 4.0, 0.0]), load], lambda t: 4.0 - numbers[2] * t**2),
+    ]
+    mechanism = lx.Mechanism([arm, load], joints, constraints=constraints)
+    state = lx.assemble(mechanism, t=0.1)
+    return jnp.concatenate([state.q, state.v])
+
+
+NUMBERS, HALVES = jnp.array([0.7, 3.0, 2.0]), jnp.array([0.35, 1.5, 1.0])
+EXACT = {
+    turned: lambda numbers: numbers[0] / 6.0 + numbers[1] / 2.0 + numbers[2] / 2.0,
+    moved: lambda numbers: jnp.stack(
+        [
+            numbers[0] * jnp.sin(0.1 * numbers[1]),
+            0.01 * numbers[2],
+            numbers[0] * numbers[1] * jnp.cos(0.1 * numbers[1]),
+            0.2 * numbers[2],
+        ]
+    ),
+}
+
+
+@pytest.mark.parametrize("of", EXACT, ids=lambda of: of.__name__)
+def test_functions_made_anew_compile_nothing(of):
+    with compilations() as begun:
+        first = of(NUMBERS)
+    with compilations() as compiled:
+        again, other = of(NUMBERS), of(HALVES)
+    assert begun
+    assert not compiled
+    np.testing.assert_array_equal(again, first)
+    for found, numbers in ((first, NUMBERS), (other, HALVES)):
+        np.testing.assert_allclose(found, EXACT[of](numbers), rtol=1e-7)
+
+
+def test_derivatives_by_an_array_that_drives_close_over():
+    found, step = jax.jit(jax.jacfwd(moved))(NUMBERS), 1e-5
+    np.testing.assert_allclose(found, jax.jacfwd(EXACT[moved])(NUMBERS), atol=1e-12)
+    differences = [(moved(NUMBERS + along) - moved(NUMBERS - along)) / (2.0 * step) for along in step * jnp.eye(3)]
+    np.testing.assert_allclose(found, np.stack(differences, axis=1), atol=1e-8)
+
+
+def test_a_mechanism_whose_functions_have_changed_is_refused():
+    speeds = {"motor": 2.0}
+    arm = lx.rod("arm", 1.0, 1.0)
+    hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")
+    build = lambda: lx.Mechanism(
+        [arm], [hinge], constraints=[lx.Drive("motor", "hinge", lambda t: speeds["motor"] * t)]
+    )
+    mechanism, now = build(), lambda mechanism: mechanism.constraints[0].right_side(0.5)
+    assert now(mechanism) == 1.0
+    speeds["motor"] = 3.0
+    for use in (
+        now,
+        lx.assemble,
+        lambda mechanism: lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=1.0),
+    ):
+        with pytest.raises(ValueError, match=r"drive 'motor': what its function reads \(speeds\) has changed .* anew"):
+            use(mechanism)
+    assert now(build()) == 1.5
