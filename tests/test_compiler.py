@@ -7,21 +7,28 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiled_as_users_do import motion
 
-from linkax.compiler import LOOPS, makes_kernels_of_loops, set_flags
+from linkax import compiler
+from linkax.compiler import LOOPS, ROOM, makes_kernels_of_loops, set_flags
 from linkax.tracing import runs_once
+
+
+def _as_users_do(name):
+    """What a program of this folder prints, without the flags of the tests."""
+    of_tests = ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR")
+    environment = {name: text for name, text in os.environ.items() if name not in of_tests}
+    program = Path(__file__).with_name(name)
+    done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
 
 
 @pytest.fixture(scope="module")
 def as_users_do():
-    of_tests = ("XLA_FLAGS", "EQX_ON_ERROR")
-    environment = {name: text for name, text in os.environ.items() if name not in of_tests}
-    program = Path(__file__).with_name("compiled_as_users_do.py")
-    done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
+    return _as_users_do("compiled_as_users_do.py")
 
 
 def test_importing_linkax_is_enough_for_kernels(as_users_do):
@@ -72,3 +79,65 @@ def test_what_runs_once_has_no_part_in_transformations_of_others():
     assert jax.jit(double)(1.0) == 2.0
     assert jax.grad(double)(1.0) == 2.0
     np.testing.assert_array_equal(jax.vmap(double)(np.arange(3.0)), [0.0, 2.0, 4.0])
+
+
+def _with_limit(monkeypatch, folder, *free):
+    """As if the process had so many memory maps left, one after another; the last one stays."""
+    left = iter([*free[:-1], *[free[-1]] * 100])
+    monkeypatch.setattr(compiler, "_maps", lambda: compiler._limit_of_maps() - next(left))
+    monkeypatch.setattr(compiler, "LIMIT_OF_MAPS", folder / "limit")
+    (folder / "limit").write_text("70000\n")
+
+
+def test_programs_are_forgotten_where_memory_maps_run_out(monkeypatch, tmp_path):
+    """In the middle of what is traced and compiled, which goes on."""
+
+    @runs_once
+    def double(x):
+        return jnp.sin(2.0 * x)
+
+    traces = []
+
+    @jax.jit
+    def kept(x):
+        traces.append(x)
+        return x + 1.0
+
+    @jax.jit
+    def both(x):
+        return jax.grad(lambda y: kept(y) ** 2 * double(np.asarray(0.3)))(x) + double(x)
+
+    assert kept(1.0) == kept(1.0) == 2.0
+    assert len(traces) == 1
+    assert compiler._limit_of_maps() - compiler._maps() > ROOM
+    _with_limit(monkeypatch, tmp_path, *[ROOM - 1, ROOM] * 2, 70_000)
+    with pytest.warns(RuntimeWarning, match=r"nearly all of the 70000 memory maps .* vm\.max_map_count=280000") as told:
+        found = both(0.5)
+    assert len(told) == 2
+    np.testing.assert_allclose(found, 3.0 * np.sin(0.6) + np.sin(1.0), rtol=1e-14)
+    assert kept(1.0) == 2.0
+    assert len(traces) == 2
+
+
+def test_no_program_is_compiled_where_memory_maps_are_held(monkeypatch, tmp_path):
+    """XLA would end the process."""
+    _with_limit(monkeypatch, tmp_path, ROOM - 1)
+    with pytest.raises(RuntimeError, match=r"hold 60001 memory maps.* 70000: too many .* vm\.max_map_count=280000"):
+        jax.jit(lambda x: x + 1.0)(1.0)
+
+
+def test_systems_that_tell_no_limit_are_left_alone(monkeypatch, tmp_path):
+    for missing in ("MAPS", "LIMIT_OF_MAPS"):
+        with monkeypatch.context() as patch:
+            patch.setattr(compiler, missing, tmp_path / "none")
+            assert jax.jit(lambda x: x + 1.0)(1.0) == 2.0
+
+
+@pytest.mark.slow
+def test_many_mechanisms_in_one_process():
+    done = _as_users_do("many_programs.py")
+    assert done["unlike"] == 60
+    assert done["cleared"] > 1
+    assert done["ends"][0] == done["ends"][1]
+    assert done["error"] < 1e-7
+    assert 0 < done["programs"] < 50

@@ -8,10 +8,11 @@ see `linkax.compiler`; import linkax before JAX makes its first array.
 
 import jax
 
-from linkax.compiler import set_flags
+from linkax.compiler import set_flags, watch_memory_maps
 
 jax.config.update("jax_enable_x64", True)
 set_flags()
+watch_memory_maps()
 
 from linkax.analysis.inverse_dynamics import InverseDynamics as InverseDynamics  # noqa: E402
 from linkax.analysis.inverse_dynamics import inverse_dynamics as inverse_dynamics  # noqa: E402
