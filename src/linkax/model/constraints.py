@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from linkax.model.elements import AbstractElement
-from linkax.model.functions import Law
+from linkax.model.functions import Law, held_unless
 from linkax.model.numbers import number, require
 from linkax.model.terms import Term, term
 
@@ -32,8 +32,8 @@ class AbstractConstraint(AbstractElement):
     def right_side(self, t) -> Float[Array, ""]:
         """At time t [s]."""
 
-    def held(self, t) -> "AbstractConstraint":
-        """The same with the right side of time t for ever."""
+    def held(self, t, unless=False) -> "AbstractConstraint":
+        """The same with the right side of time t for ever, where it is not to go on; that may be traced."""
         return self
 
 
@@ -119,7 +119,9 @@ class Drive(LinearConstraint):
     def right_side(self, t):
         return self.motion(t)
 
-    def held(self, t):
+    def held(self, t, unless=False):
+        if unless is not False:
+            return Drive(self.name, self.terms[0], held_unless(self.motion, t, unless))
         return Coupling(self.name, dict(zip(self.terms, np.ones(1), strict=True)), self.right_side(t))
 
 

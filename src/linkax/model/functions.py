@@ -73,3 +73,12 @@ def number_or_law(entry, shape: tuple[int, ...], what: str):
 def evaluated(entry, *arguments):
     """A number, or what a `Law` says."""
     return entry(*arguments) if isinstance(entry, Law) else entry
+
+
+def held_unless(law: Law, t, moves):
+    """A function of time as it is where `moves`; elsewhere as it is at time t for ever."""
+    return jax.tree_util.Partial(_held_unless, law, t, moves)
+
+
+def _held_unless(law, start, moves, t):
+    return law(start) + jnp.where(moves, law(t) - law(start), 0.0)

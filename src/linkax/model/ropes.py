@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from linkax.model.bodies import AbstractBody, Frame, frame_of
 from linkax.model.constraints import AbstractConstraint, checked_name
 from linkax.model.forces import AbstractForce, Load
-from linkax.model.functions import Law, evaluated
+from linkax.model.functions import Law, evaluated, held_unless
 from linkax.model.numbers import listed, positive, zero_or_more
 from linkax.spatial.vectors import dot, length
 
@@ -92,8 +92,11 @@ class Rope(AbstractConstraint):
     def right_side(self, t):
         return -evaluated(self.length, t)
 
-    def held(self, t):
-        return Rope(self.name, self.points, evaluated(self.length, t)) if self.is_driven else self
+    def held(self, t, unless=False):
+        if not self.is_driven:
+            return self
+        length = evaluated(self.length, t) if unless is False else held_unless(self.length, t, unless)
+        return Rope(self.name, self.points, length)
 
     def value(self, configuration):
         """Minus its length: rows are such that their multipliers are tensions."""
