@@ -61,9 +61,12 @@ def test_a_pendulum_comes_to_rest_and_vibrates():
     np.testing.assert_allclose(found.damping, [[rate]], rtol=1e-12)
     damped = np.sqrt(natural**2 - rate**2 / 4.0)
     np.testing.assert_allclose(sorted(found.eigenvalues.imag), [-damped, damped], rtol=1e-10)
-    # Upright it is at rest too, and falls at that rate.
-    upright = lx.equilibrium(mechanism, lx.State(jnp.array([np.pi / 2]), jnp.zeros(1)))
+    # Upright it is at rest too, and falls at that rate: an equilibrium to go on from.
+    upright = lx.State(jnp.array([np.pi / 2]), jnp.zeros(1))
     np.testing.assert_allclose(lx.linearise(mechanism, upright).natural_frequencies, [-natural], rtol=1e-12)
+    np.testing.assert_allclose(np.sin(lx.equilibrium(mechanism, upright).q), -1.0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"off an equilibrium.*'hinge' accelerates by -18.39.*linkax.equilibrium"):
+        lx.linearise(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)))
 
 
 def test_frequency_on_the_tangent_space_of_a_redundant_loop():

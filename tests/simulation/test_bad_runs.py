@@ -441,11 +441,12 @@ def _readings(numbers):
     )
     state = lx.State(jnp.full(1, 0.3), jnp.zeros(1))
     results = [run.result, lx.Solution.of_state(mechanism, state).result]
+    rest = lx.equilibrium(mechanism, state)
     found = [
         assembled.v,
         lx.mobility(mechanism, state).distance,
-        lx.equilibrium(mechanism, state).q,
-        lx.linearise(mechanism, state, degrees_of_freedom=1).natural_frequencies,
+        rest.q,
+        lx.linearise(mechanism, rest, degrees_of_freedom=1).natural_frequencies,
         lx.inverse_dynamics(mechanism, state, {"pin": 1.0}).acceleration,
     ]
     of = lambda kind: jnp.stack([result == kind for result in results])

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 
 from linkax.linalg.placing import placed
 from linkax.model.topology import Topology
-from linkax.spatial.quaternions import conjugate, from_rotation_vector, multiply, normalised
+from linkax.spatial.quaternions import conjugate, from_rotation_vector, multiply, normalised, rotation_matrix
+from linkax.spatial.rotations import rotate
 
 
 def _places(topology):
@@ -38,6 +39,15 @@ def retract(topology: Topology, q, change) -> Float[Array, " n_q"]:
     in_q, in_v = _places(topology)
     turned = normalised(multiply(from_rotation_vector(change[in_v]), q[in_q]))
     return placed(q + _of_plain(topology, change), in_q, turned)
+
+
+def carried(topology: Topology, motion, change) -> Float[Array, " n_v"]:
+    """A small change of coordinates q as one of q ⊕ motion, (n_v,) each: quaternions take it along as they turn."""
+    if not len(topology.quaternions):
+        return change
+    _, in_v = _places(topology)
+    turn = rotation_matrix(from_rotation_vector(motion[in_v]))
+    return placed(change, in_v, rotate(turn, change[in_v]))
 
 
 def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:

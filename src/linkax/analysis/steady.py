@@ -1,0 +1,106 @@
+"""Steady motion: joints that go on at their speeds, as drives ask, and nothing else changes."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from linkax.equations.configuration import configure
+from linkax.equations.coordinates import retract
+from linkax.equations.dynamics import applied_load, inertial_wrench
+from linkax.equations.loops import gaps, jacobian, rate
+from linkax.equations.motion import Motion
+from linkax.equations.system import System, system_of
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import known
+from linkax.simulation.state import State
+
+# Radians, or lengths of the mechanism, after which a motion is looked at again: incommensurable, so that what is
+# periodic does not repeat there.
+LATER = np.array([0.7, 1.9, 41.0])
+AGREES = 1e-6  # of speeds, and of forces
+
+
+def may_move(state: State) -> bool:
+    """Whether a state moves, as far as it is known."""
+    v = known(state.v)
+    return v is None or bool(np.any(v != 0.0))
+
+
+def system_in(mechanism: Mechanism, state: State, t, moves: bool) -> System:
+    """The mechanism's numbers, with drives that hold their joints at time t where the state is at rest."""
+    system, unless = system_of(mechanism, state.q.dtype), jnp.any(state.v != 0.0) if moves else False
+    return dataclasses.replace(system, constraints=tuple(each.held(t, unless) for each in system.constraints))
+
+
+class Nearby(eqx.Module):
+    """A mechanism near closed coordinates q, in coordinates y of the tangent space: q ⊕ T y.
+
+    - `basis`: T, (n_v, n_v), columns orthonormal in a metric, zero where there is no tangent; `dual`: its inverse
+      on the tangent space.
+    """
+
+    system: System
+    method: TangentSpace
+    t: Float[Array, ""]
+    q: Float[Array, " n_q"]
+    basis: Float[Array, "n_v n_v"]
+    dual: Float[Array, "n_v n_v"]
+
+    def at(self, y):
+        """Coordinates q."""
+        return retract(self.system.topology, self.q, self.basis @ y)
+
+    @staticmethod
+    def slopes(function, rest):
+        """A function of a vector at `rest`, and its derivative."""
+        follow = lambda change: jax.jvp(function, (rest,), (change,))
+        return jax.vmap(follow, out_axes=(None, 1))(jnp.eye(len(rest), dtype=rest.dtype))
+
+
+class Instants(NamedTuple):
+    """Where a motion at constant speeds leads: times [s], and what has moved by then, (k,) and (k, n_v)."""
+
+    t: Float[Array, " k"]
+    motion: Float[Array, "k n_v"]
+
+
+def fastest(system, v):
+    """The largest speed, in radians and lengths of the mechanism [1/s]."""
+    return jnp.max(jnp.abs(v / system.units), initial=0.0)
+
+
+def instants(system: System, t, v) -> Instants:
+    """At `LATER`."""
+    speed = lax.stop_gradient(fastest(system, v))
+    duration = jnp.where(speed > 0.0, LATER / jnp.where(speed > 0.0, speed, 1.0), 0.0)
+    return Instants(t + duration, duration[:, None] * v)
+
+
+def widest_gap(system: System, t, q) -> Float[Array, ""]:
+    """How far the loops are open, in radians and lengths of the mechanism."""
+    loops = gaps(configure(system, t, q))
+    open_ = [loops.distance / system.length, loops.angle, loops.constraints / system.coupling_unit]
+    return jnp.max(jnp.concatenate(open_), initial=0.0)
+
+
+def missed_rates(system: System, t, q, v) -> Float[Array, " m"]:
+    """What the speeds of a state miss of those that the loops and drives ask for, relative to the largest of both."""
+    asked = rate(system, t)
+    largest = jnp.maximum(fastest(system, v), jnp.max(jnp.abs(asked), initial=0.0))
+    return jnp.abs(jacobian(configure(system, t, q)) @ v - asked) / jnp.where(largest > 0.0, largest, 1.0)
+
+
+def largest_force(motion: Motion) -> Float[Array, ""]:
+    """The sum of sizes of all forces, in balance or not: what rounding of their sum is small against [N m]."""
+    load, system = applied_load(motion), motion.system
+    force, moment = inertial_wrench(motion, motion.angular_bias[:-1], motion.bias[:-1])
+    size = lambda vectors: jnp.sum(jnp.abs(vectors))
+    on_bodies = system.length * (size(load.force) + size(force)) + size(load.moment) + size(moment)
+    return on_bodies + size(system.units * load.joint_force)
