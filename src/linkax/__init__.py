@@ -80,6 +80,7 @@ from linkax.simulation.accuracy import DRAFT as DRAFT  # noqa: E402
 from linkax.simulation.accuracy import PRECISE as PRECISE  # noqa: E402
 from linkax.simulation.accuracy import Accuracy as Accuracy  # noqa: E402
 from linkax.simulation.assembly import AssemblyError as AssemblyError  # noqa: E402
+from linkax.simulation.assembly import AssemblyWarning as AssemblyWarning  # noqa: E402
 from linkax.simulation.assembly import assemble as assemble  # noqa: E402
 from linkax.simulation.instant import Pose as Pose  # noqa: E402
 from linkax.simulation.instant import Power as Power  # noqa: E402

@@ -154,3 +154,87 @@ def test_rods_that_cannot_make_a_triangle():
     ]
     with pytest.raises(lx.AssemblyError, match=r"joint 'top' does not close: a gap of 1 m remains"):
         lx.assemble(lx.Mechanism([near, far], joints))
+
+
+AXIAL_STIFFNESS = 1.4e7
+
+
+def four_bar(length=0.8, ground=1.0, flexible=True):
+    crank, rocker = lx.rod("crank", length=0.4, mass=1.0), lx.rod("rocker", length=0.9, mass=1.0)
+    section = lx.Section(500.0, 0.5, AXIAL_STIFFNESS)
+    beam = lx.Beam("coupler", length, section, elements=1, bends="z", torsion=False)
+    coupler = beam if flexible else lx.rod("coupler", length=length, mass=1.0)
+    hinge = lambda *ends, **options: lx.Revolute(*ends, axis="z", **options)
+    joints = [
+        hinge("A", lx.GROUND, crank.at("base")),
+        hinge("B", crank.at("tip"), coupler.at("base")),
+        hinge("C", coupler.at("tip"), rocker.at("base")),
+        hinge("D", rocker.at("tip"), lx.GROUND.at([ground, 0.0, 0.0]), cut=True),
+    ]
+    return lx.Mechanism([crank, coupler, rocker], joints)
+
+
+def assembled(length, guess, flexible=True):
+    """Coordinates and speeds of the joints that a beam and a rod have in common, and strains of the beam."""
+    mechanism = four_bar(length, flexible=flexible)
+    state = lx.assemble(mechanism, speeds={"A": 1.0}, guess={"A": guess[0], "B": guess[1]})
+    of = lambda name: [state.q[mechanism.topology.coordinates[name]], state.v[mechanism.topology.speeds[name]]]
+    return jnp.concatenate([*of("A"), *of("B")]), jnp.concatenate(of("coupler")) if flexible else jnp.zeros(0)
+
+
+GUESSES = np.array([[1.0, -0.3], [1.0, -0.55], [0.5, 0.2], [2.0, 2.0]])
+
+
+@pytest.mark.parametrize("guess", [*GUESSES, [0.0, 0.0]])
+def test_loops_close_with_beams_straight(guess):
+    """From near and from bad guesses, the singular one too, where all is in one line."""
+    np.testing.assert_allclose(assembled(0.8, guess)[1], 0.0, atol=1e-12)
+
+
+def test_a_beam_that_the_loops_strain_is_named():
+    """A four-bar that is too short by 1 cm; the energy is that of a bar stretched so, to one per cent."""
+    with pytest.warns(lx.AssemblyWarning, match=r"beam 'coupler' is strained, with an energy of .* J") as warned:
+        lx.assemble(four_bar(ground=2.11), speeds={"A": 0.0}, guess={"A": 0.3, "B": 0.2})
+    energy = float(str(warned[0].message).split("energy of ")[1].split(" J")[0])
+    np.testing.assert_allclose(energy, AXIAL_STIFFNESS * 0.01**2 / (2.0 * 0.8), rtol=0.01)
+
+
+@pytest.mark.slow
+def test_loops_with_a_beam_close_as_with_a_rod():
+    """Coordinates, speeds, their derivatives by the length of the coupler and by the guess, in a batch of guesses."""
+
+    def batch(flexible):
+        both = lambda *numbers: 2 * (assembled(*numbers, flexible),)
+        slopes = jax.jacfwd(both, (0, 1), has_aux=True)
+        return jax.jit(jax.vmap(slopes, in_axes=(None, 0)))(0.8, GUESSES)
+
+    (of_beam, of_strains), (beam, _) = batch(True)
+    (of_rod, _), (rod, _) = batch(False)
+    close = lambda found, known: np.testing.assert_allclose(found, known, atol=1e-9)
+    close(beam, rod)
+    for found, known, of_strain in zip(of_beam, of_rod, of_strains, strict=True):
+        close(found, known)
+        close(of_strain, 0.0)
+
+
+def strained_energy(deflection):
+    """Of a cantilever of length 2 and E I = 1, whose tip slides on a rail parallel to it, at a distance."""
+    beam = lx.Beam("beam", 2.0, lx.Section(1.0, 3.0, 5e3), elements=1, bends="z", torsion=False)
+    block, aside = lx.point_mass("block", 1.0), jnp.asarray(deflection) * np.array([0.0, 1.0, 0.0])
+    joints = [
+        lx.Fixed("clamp", lx.GROUND, beam),
+        lx.Prismatic("rail", lx.GROUND.at(aside), block, axis="x"),
+        lx.Revolute("pin", beam.at("tip"), block, axis="z"),
+    ]
+    mechanism = lx.Mechanism([beam, block], joints)
+    return lx.Solution.of_state(mechanism, lx.assemble(mechanism)).potential_energy()[0]
+
+
+@pytest.mark.slow
+def test_beams_are_strained_with_the_least_energy():
+    """3 E I w² / 2 L³ where deflections w are small; the derivative is the force, of large ones too."""
+    at, step = jnp.array([0.01, 0.1, 0.2]), 1e-5
+    energy = jax.jit(jax.vmap(strained_energy))
+    force = jax.jit(jax.vmap(jax.grad(strained_energy)))(at)
+    np.testing.assert_allclose(energy(at)[0], 3.0 * at[0] ** 2 / 16.0, rtol=1e-4)
+    np.testing.assert_allclose(force, (energy(at + step) - energy(at - step)) / (2.0 * step), rtol=1e-6)

@@ -249,9 +249,17 @@ class BeamElasticity(AbstractForce):
         forces = -self._forces(q + self.damping * v)
         return none._replace(joint_force=none.joint_force.at[topology.speeds[self.beam]].set(forces))
 
+    @property
+    def matrix(self) -> Float[Array, "n n"]:
+        """K, symmetric and positive definite."""
+        return jax.vmap(self._forces)(jnp.eye((self.elements + 1) * len(self.stiffness)))
+
+    def energy(self, coordinates):
+        """Of its coordinates [J]."""
+        return coordinates @ self._forces(coordinates) / 2.0
+
     def potential_energy(self, configuration):
-        q = configuration.joint_coordinates(self.beam)
-        return q @ self._forces(q) / 2.0
+        return self.energy(configuration.joint_coordinates(self.beam))
 
 
 class Parts(NamedTuple):

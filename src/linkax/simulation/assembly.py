@@ -1,10 +1,13 @@
 """Consistent states from partial positions and speeds."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.scipy.linalg import block_diag
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, on_manifold, rates, retract, speeds
@@ -13,6 +16,8 @@ from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
 from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.linalg.placing import placed
+from linkax.model.beams import BeamElasticity
 from linkax.model.mechanism import Mechanism
 from linkax.model.terms import Term
 from linkax.simulation.accuracy import BALANCED
@@ -31,10 +36,16 @@ BESIDE = 1e-2
 CLOSED = 1e-9  # remaining gap, relative to the mechanism's length
 # Starts of the search beside the guess, by which it leaves a saddle of the gap, or a bad guess.
 ATTEMPTS = np.array([0.0, 1e-2, 1e-1, 0.3, 0.3, 0.6, 0.6, 1.0, 1.0, 1.0, 1.5, 1.5, 1.5, 1.5, 3.0, 3.0, 3.0, 3.0])
+# The same where strains move too, and what these count for next to the rows, little; where that stops short, nothing.
+STRAINED = np.array([[0.0, 1e-2, 1e-2, 0.0, 1e-2, 1e-2], [0.1, 0.1, 0.1, 0.0, 0.0, 0.0]])
 
 
 class AssemblyError(ValueError):
     """The loops of a mechanism cannot be closed at the positions that were asked for."""
+
+
+class AssemblyWarning(UserWarning):
+    """The loops of a mechanism close only where beams are strained."""
 
 
 def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t=0.0) -> State:
@@ -53,9 +64,10 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     Coordinates that are not held change as little as the loops allow from the guess, and
     speeds that are not held are the smallest that the loops allow, both measured in radians
     and in lengths of the mechanism. Where the search does not get from the guess to closed loops,
-    it starts again beside it, a little and then farther. In a singular configuration, where
-    branches of the motion cross, speeds lie on the branch nearest to these; give more of them to
-    choose another.
+    it starts again beside it, a little and then farther. Strains of beams stay as guessed, by default
+    zero; where no start leads to closed loops so, they change, with little energy. In a singular
+    configuration, where branches of the motion cross, speeds lie on the branch nearest to these; give
+    more of them to choose another.
 
     Derivatives by numbers of the mechanism, positions and speeds given, and the guess, to any order: of
     coordinates that are not held and that the loops leave free, those of the nearest to the guess, as if
@@ -65,6 +77,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
     raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
+    Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain.
     """
     check_mechanism(mechanism)
     t = jnp.asarray(checked_time(t, "t"))
@@ -78,7 +91,17 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     state, remainder = _assemble(mechanism, positions, speeds, guess, t)
     if not all_known((state, remainder)):
         return State(state.q, jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf))
-    _raise_if_open(mechanism, state, t, jax.tree.map(np.asarray, remainder))
+    remainder = jax.tree.map(np.asarray, remainder)
+    _raise_if_open(mechanism, state, t, remainder)
+    for beam, (strain, energy) in remainder.strained.items():
+        if strain > remainder.most:
+            warnings.warn(
+                f"beam {beam!r} is strained, with an energy of {energy:.3g} J, as the loops do not close otherwise; "
+                "check lengths and offsets, hold fewer positions, or give another guess; linkax.equilibrium finds the "
+                "strains at rest",
+                AssemblyWarning,
+                stacklevel=2,
+            )
     return state
 
 
@@ -118,13 +141,14 @@ def _raise_if_open(mechanism, state, t, remainder):
 
 
 class _Remainder(eqx.Module):
-    """What is left open, for the error message."""
+    """What is left open, for the error message; and of each beam the largest change of a strain, and its energy."""
 
     gap: Gap
     length: jax.Array
     positions: Given
     speeds: Given
     off_branch: jax.Array
+    strained: dict
 
     @property
     def most(self):
@@ -176,53 +200,94 @@ class _Demand(eqx.Module):
         closed = as_if_closed(configuration)
         return self.rows(configuration), jnp.concatenate([jacobian(closed), flips(closed)[1], *held])
 
+    def back(self, q, guess):
+        """The change that undoes that of the strains since a guess."""
+        change = speeds(self.system.topology, q, guess - q)
+        strains = _strains(self.system)
+        return placed(jnp.zeros_like(change), strains, change[strains])
+
+    def metrics(self):
+        """In radians and lengths of the mechanism, with strains by energy, over that of the softest or the hardest."""
+        strains, units = _strains(self.system), self.system.units
+        energy = _elastic_energy(self.system)
+        sizes = jnp.diagonal(energy) * units[strains] ** 2
+        of = lambda size: jnp.diag(units**-2).at[np.ix_(strains, strains)].set(energy / size)
+        return jax.vmap(of)(jnp.stack([jnp.min(sizes), jnp.max(sizes)]))
+
     def descent(self, rows, slopes):
-        """The steepest descent of the rows' squares, as long as their linearisation says."""
-        downhill = -(self.system.units**2) * (rows @ slopes)
+        """The steepest descent of the rows' squares, without strains, as long as their linearisation says."""
+        strains = _strains(self.system)
+        downhill = placed(-(self.system.units**2) * (rows @ slopes), strains, jnp.zeros(len(strains), rows.dtype))
         change = slopes @ downhill
         scale = jnp.sum(change * change)
         return downhill * jnp.where(scale > 0.0, -(rows @ change) / jnp.where(scale > 0.0, scale, 1.0), 0.0)
 
-    def meet(self, q):
-        """Damped Newton steps from q until the rows vanish or stop falling; descent where those fail.
+    def meet(self, q, guess, moves, weight):
+        """Damped Newton steps from q until rows and strains vanish or stop falling; descent where those fail.
+
+        **Arguments:** `guess`: coordinates whose strains they lead back to; `moves`: which coordinates they change;
+        `weight`: of strains in radians and lengths of the mechanism, next to the rows.
 
         **Returns:** where they lead, and the size of the rows there.
         """
+        metrics = self.metrics() if len(_strains(self.system)) else None
+
+        def newton(rows, slopes, back):
+            if metrics is None:
+                return _nearest(self.system, back, slopes, -rows)[None]
+            return jax.vmap(lambda metric: _nearest_in(metric, self.system.units, back, slopes, -rows))(metrics)
+
+        def strained(q):
+            back = self.back(q, guess)
+            return jnp.zeros((), q.dtype) if metrics is None else weight * jnp.sqrt(back @ metrics[1] @ back)
 
         def unfinished(carry):
-            count, _, size, before = carry
-            return (count == 0) | ((count < MOST_STEPS) & (size > SMALL) & (size < before))
+            count, _, _, miss, before = carry
+            return (count == 0) | ((count < MOST_STEPS) & (miss > SMALL) & (miss < before))
 
         def improve(carry):
-            count, q, size, _ = carry
+            count, q, _, miss, _ = carry
             rows, slopes = self.linearised(q)
-            newton = _nearest(self.system, jnp.zeros_like(self.system.units), slopes, -rows)
-            steps = jnp.stack([newton, self.descent(rows, slopes)])
+            slopes = jnp.where(moves, slopes, 0.0)
+            steps = [
+                newton(rows, slopes, jnp.where(weight > 0.0, self.back(q, guess), 0.0)),
+                self.descent(rows, slopes)[None],
+            ]
+            steps = jnp.concatenate(steps)
             longest = jnp.max(jnp.abs(steps / self.system.units), axis=1, keepdims=True, initial=0.0)
             steps = steps * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0))
             changes = (STEP_FRACTIONS[:, None, None] * steps).reshape(-1, steps.shape[1])
             tries = jax.vmap(lambda change: retract(self.system.topology, q, change))(changes)
             tries = jnp.concatenate([tries, q[None]])
             sizes = jax.vmap(lambda q: _size(self.rows(configure(self.system, self.t, q))))(tries)
-            best = jnp.argmin(sizes)
-            return count + 1, tries[best], sizes[best], size
+            misses = sizes + jax.vmap(strained)(tries)
+            best = jnp.argmin(misses)
+            return count + 1, tries[best], sizes[best], misses[best], miss
 
         infinite = jnp.asarray(jnp.inf, q.dtype)
-        _, q, size, _ = lax.while_loop(unfinished, improve, (jnp.zeros((), int), q, infinite, infinite))
-        return q, size
+        begin = (jnp.zeros((), int), q, infinite, infinite, infinite)
+        return lax.while_loop(unfinished, improve, begin)[1:3]
 
     def search(self, q):
         """Coordinates that meet the demand, from q, or else from beside it; the nearest miss where none do."""
-        beside = np.random.default_rng(0).normal(size=(len(ATTEMPTS), self.system.topology.num_speeds))
-        starts = jnp.asarray(ATTEMPTS[:, None] * beside, q.dtype) * self.system.units
+        fixed = np.isin(np.arange(self.system.topology.num_speeds), _strains(self.system))
+        # Beams are strained only where that leads to no closed loops, by what the nearest miss leaves open.
+        sizes, weights = np.concatenate(
+            [[ATTEMPTS, 0.0 * ATTEMPTS], [*STRAINED] if np.any(fixed) else 2 * [[]]], axis=1
+        )
+        beside = sizes[:, None] * np.random.default_rng(0).normal(size=(len(sizes), len(fixed)))
+        starts, weights = jnp.asarray(beside, q.dtype) * self.system.units, jnp.asarray(weights, q.dtype)
 
         def unfinished(carry):
             count, _, size = carry
-            return (count < len(ATTEMPTS)) & (size > CLOSED)
+            return (count < len(starts)) & (size > CLOSED)
 
         def attempt(carry):
             count, best, size = carry
-            found, reached = self.meet(retract(self.system.topology, q, starts[count]))
+            strains = count >= len(ATTEMPTS)
+            moves = strains | jnp.logical_not(fixed)
+            begin, aside = jnp.where(strains, best, q), jnp.where(moves, starts[count], 0.0)
+            found, reached = self.meet(retract(self.system.topology, begin, aside), q, moves, weights[count])
             return count + 1, jnp.where(reached < size, found, best), jnp.minimum(reached, size)
 
         begin = (jnp.zeros((), int), q, jnp.asarray(jnp.inf, q.dtype))
@@ -233,10 +298,43 @@ def _size(rows):
     return jnp.sqrt(jnp.sum(rows * rows))
 
 
+def _beams(system):
+    """The elastic forces of beams."""
+    return [force for force in system.forces if isinstance(force, BeamElasticity)]
+
+
+def _strains(system):
+    """Where the strains of beams are among the speeds."""
+    taken = [system.topology.speeds[beam.beam] for beam in _beams(system)]
+    return np.concatenate([np.zeros(0, int), *(np.arange(of.start, of.stop) for of in taken)])
+
+
+def _elastic_energy(system):
+    """Twice that of the strains of beams, as a matrix."""
+    return block_diag(*(beam.matrix for beam in _beams(system)))
+
+
 def _nearest(system, x, slopes, right):
-    """What is nearest to x, in radians and lengths of the mechanism, with slopes @ x = right."""
-    inverse = invert(None, slopes, system.units, BALANCED.method(x.dtype).rank_tolerance)
-    metric = jnp.diag(system.units**-2)
+    """What is nearest to x, in radians and lengths of the mechanism, with slopes @ x = right.
+
+    Strains of beams differ from x, by as little energy as they can, only in what all else leaves open.
+    """
+    strains, units = _strains(system), system.units
+    if not len(strains):
+        return _nearest_in(None, units, x, slopes, right)
+    others = np.setdiff1d(np.arange(len(units)), strains)
+    of_others = lambda x, right: _nearest_in(None, units[others], x, slopes[:, others], right)
+    left = lambda right: right - slopes[:, others] @ of_others(jnp.zeros_like(x[others]), right)
+    open_ = jax.vmap(left, in_axes=1, out_axes=1)(slopes[:, strains])
+    strained = _nearest_in(_elastic_energy(system), units[strains], x[strains], open_, left(right))
+    rest = of_others(x[others], right - slopes[:, strains] @ strained)
+    return placed(placed(x, strains, strained), others, rest)
+
+
+def _nearest_in(metric, units, x, slopes, right):
+    """What is nearest to x in a metric, or in units for None, with slopes @ x = right."""
+    inverse = invert(metric, slopes, units, BALANCED.method(x.dtype).rank_tolerance)
+    metric = jnp.diag(units**-2) if metric is None else metric
     return constrained_solve(inverse, metric, slopes, metric @ x, right)[0]
 
 
@@ -346,7 +444,9 @@ def _assemble(mechanism, positions, speeds, guess, t):
             if along.joint in topology.coordinates:
                 q = q.at[topology.places(along)].set(entry)
     demand = _Demand(system, t, positions)
-    q = _found(demand, on_manifold(topology, q))
+    begin = on_manifold(topology, q)
+    q = _found(demand, begin)
+    off = jnp.abs(demand.back(q, begin))
     configuration = configure(system, t, q)
     v, misses, off_branch = _speeds(configuration, speeds)
     remainder = _Remainder(
@@ -355,5 +455,9 @@ def _assemble(mechanism, positions, speeds, guess, t):
         positions=Given(positions.terms, demand.misses(configuration)),
         speeds=misses,
         off_branch=off_branch,
+        strained={
+            beam.beam: (jnp.max(off[topology.speeds[beam.beam]]), beam.energy(q[topology.coordinates[beam.beam]]))
+            for beam in _beams(system)
+        },
     )
     return State(q, v), remainder
