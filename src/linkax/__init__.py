@@ -88,6 +88,7 @@ from linkax.simulation.instant import Violation as Violation  # noqa: E402
 from linkax.simulation.results import RESULTS as RESULTS  # noqa: E402
 from linkax.simulation.results import AccuracyWarning as AccuracyWarning  # noqa: E402
 from linkax.simulation.results import SimulationError as SimulationError  # noqa: E402
+from linkax.simulation.results import StiffnessWarning as StiffnessWarning  # noqa: E402
 from linkax.simulation.runge_kutta import RungeKutta4 as RungeKutta4  # noqa: E402
 from linkax.simulation.simulate import simulate as simulate  # noqa: E402
 from linkax.simulation.solution import Solution as Solution  # noqa: E402

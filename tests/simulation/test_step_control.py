@@ -1,5 +1,6 @@
-"""The step control, on steps that are made up; and when implicit steps are given up."""
+"""The step control, on steps that are made up; when implicit steps are given up; what chooses the steps is told."""
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import diffrax
@@ -159,3 +160,28 @@ def test_iterations_end_where_rounding_within_the_tolerance_is_left(tolerance, e
     found = optx.root_find(noisy, Chord(0.0, tolerance), jnp.asarray(1.001), max_steps=30, throw=False)
     assert (found.result == optx.RESULTS.successful) == ends
     assert found.stats["num_steps"] <= 10 or not ends
+
+
+def held(stiffness, damping):
+    """A weight on a slide, held by a spring and a damper."""
+    weight = lx.point_mass("weight", 1.0)
+    slide = lx.Prismatic("slide", lx.GROUND, weight, axis="y")
+    forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointSpring("slide", stiffness), lx.JointDamper("slide", damping)]
+    return lx.Mechanism([weight], [slide], forces)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "damping", "duration", "named"),
+    [(1e8, 0.0, 0.5, "JointSpring"), (0.0, 1e4, 0.5, "JointDamper"), (1e2, 0.0, 200.0, None)],
+)
+def test_an_element_that_chooses_the_steps_is_named(stiffness, damping, duration, named):
+    """By its rate, √(k / m) or c / m, and not where the motion chooses them, however long it takes."""
+    mechanism, match = held(stiffness, damping), rf"{named}.*'slide'.* 1\.0e\+04 1/s"
+    with nullcontext() if named is None else pytest.warns(lx.StiffnessWarning, match=match):
+        lx.simulate(mechanism, lx.assemble(mechanism), t1=duration, max_steps=4096)
+
+
+def test_a_run_that_an_element_keeps_from_its_end_names_it():
+    mechanism = held(1e12, 0.0)
+    with pytest.raises(lx.SimulationError, match=r"maximum number of solver steps.*JointSpring.* 1\.0e\+06 1/s"):
+        lx.simulate(mechanism, lx.assemble(mechanism), t1=2.0, max_steps=4096)

@@ -1,11 +1,13 @@
 """Why a simulation failed: the elements to blame, found on the host after the run."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from linkax.equations.configuration import configure
+from linkax.equations.configuration import along_speeds, configure
+from linkax.equations.coordinates import retract
 from linkax.equations.dynamics import mass_matrix
 from linkax.equations.loops import gaps, jacobian, residual
 from linkax.equations.motion import move
@@ -16,6 +18,7 @@ from linkax.linalg.constrained_solve import invert
 from linkax.model.constraints import Drive
 from linkax.simulation.outset import MOVES, moving_joints
 from linkax.simulation.results import RESULTS
+from linkax.tracing import runs_once
 
 AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
 OPEN_ULPS = 1e3  # that loops are open where constraints contradict each other
@@ -26,6 +29,10 @@ TO_BLAME = 100.0  # times the definiteness of the mass matrix: share of an inert
 LINGERS = 3e-5  # mean distance from a singular configuration of a motion that does not leave it
 STAYS_ULPS = 8.0  # the same of what stands still in it
 PASSES = 3e-2  # distance from a singular configuration that branches are told apart from in single precision
+MANY_STEPS = 1000
+SHORT = 3e-2  # what the motion turns, or moves in lengths of the mechanism, in a mean step that it does not choose
+FAST = 0.5  # rate of an element that chooses the steps, times their mean length
+RESOLVED = 5.0  # the same, below which an explicit solver takes about as many steps: Dopri8's reach 2 to 3
 NULL = 1e-10  # eigenvalue of a mass matrix of ones
 
 
@@ -190,6 +197,54 @@ def uncertain_branch(closest, average) -> str:
             f"{average:.0e}: rounding may move it from one to another, which puts it off by more than that."
         )
     return ""
+
+
+def too_fast(solution, solver, t0) -> str:
+    """A sentence on the element whose rate, and not the motion, chooses the steps, or nothing."""
+    count, duration = int(solution.stats["num_steps"]), float(solution.t_end - t0)
+    if solution.v is None or count < MANY_STEPS:
+        return ""
+    system, step = system_of(solution.mechanism, solution.v.dtype), duration / count
+    turns = np.max(np.abs(solution.v / system.units), axis=1, initial=0.0)[np.isfinite(solution.ts)]
+    if not len(turns) or not np.mean(turns) * step < SHORT:
+        return ""
+    gram, *matrices = map(np.asarray, _elements(solution.mechanism, solution.accuracy, solution.t_end, solution.end))
+    moves = np.diagonal(gram) > 0.0
+    to_speeds = np.linalg.inv(np.linalg.cholesky(gram[np.ix_(moves, moves)]))
+    largest = lambda of: np.max(
+        np.abs(np.linalg.eigvals(to_speeds @ of[:, moves][:, :, moves] @ to_speeds.T)), axis=1, initial=0.0
+    )
+    stiffness, damping = map(largest, matrices)
+    rates = np.maximum(np.sqrt(stiffness), damping)
+    fastest = int(np.argmax(rates))
+    turned, implicit = rates[fastest] * step, isinstance(solver, diffrax.AbstractImplicitSolver)
+    if not (FAST < turned < RESOLVED if implicit else turned > FAST):
+        return ""
+    explicit = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
+    rigid = (
+        "take a rigid joint or constraint in its place, or, where it has come to rest or the tolerance is loose, "
+        "solver=diffrax.Kvaerno5()"
+    )
+    return (
+        f" {solution.mechanism.forces[fastest].described}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not the "
+        f"motion, chooses the {count} steps, {step:.1e} s each; {explicit if implicit else rigid}."
+    )
+
+
+@runs_once
+def _elements(mechanism, accuracy, t, state):
+    """Masses in directions that the loops leave, stiffness and damping there of each force element, (n, n_v, n_v)."""
+    system = system_of(mechanism, state.q.dtype)
+    found = accuracy.method(system.dtype).departure(system, t, state.q)
+    basis, still = found.crossing.inverse.basis, jnp.zeros_like(state.v)
+
+    def forces(change, faster):
+        motion = move(configure(system, t, retract(system.topology, state.q, basis @ change)), state.v + basis @ faster)
+        loads = [force.load(t, motion) for force in mechanism.forces]
+        along = lambda load: load.joint_force + along_speeds(motion.configuration, load.force, load.moment)
+        return jnp.stack([along(load) @ basis for load in loads])
+
+    return basis.T @ found.mass @ basis, *jax.jacfwd(forces, (0, 1))(still, still)
 
 
 def _lost_inertia(system, below=LOST):

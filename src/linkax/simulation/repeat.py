@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from linkax.simulation.integration import MechanismControl
-from linkax.simulation.results import AccuracyWarning
+from linkax.simulation.results import AccuracyWarning, StiffnessWarning
 
 FINEST = 1e-13  # tolerance
 REFINED_STEPS = 4  # as many as in the run before
@@ -85,7 +85,8 @@ class Repeat(eqx.Module):
     def _run(self, solution, state, **options):
         formulation = solution.formulation
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AccuracyWarning)  # how far off a run is, this one is to tell
+            for kind in (AccuracyWarning, StiffnessWarning):  # what a run is like, this one is to tell
+                warnings.simplefilter("ignore", kind)
             return self.simulate(solution.mechanism, state, formulation=formulation, throw=False, **options)
 
 

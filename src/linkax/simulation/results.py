@@ -71,6 +71,10 @@ class AccuracyWarning(UserWarning):
     """A simulation that rounding keeps from the tolerance asked for; `Solution.error_estimate` tells how far."""
 
 
+class StiffnessWarning(UserWarning):
+    """A simulation whose steps one fast element chooses, and not the motion."""
+
+
 class SimulationError(RuntimeError):
     """A simulation that did not reach its end; `solution` holds the part computed."""
 

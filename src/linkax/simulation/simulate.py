@@ -18,7 +18,7 @@ from linkax.model.functions import Function
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import flag, instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.diagnosis import cause, lost_accuracy, uncertain_branch
+from linkax.simulation.diagnosis import cause, lost_accuracy, too_fast, uncertain_branch
 from linkax.simulation.given import check_accuracy, checked_state, checked_time, sound_numbers
 from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.options import (
@@ -32,7 +32,14 @@ from linkax.simulation.options import (
 from linkax.simulation.outset import Outset, depart
 from linkax.simulation.repeat import DEFAULT_SAVES, Repeat
 from linkax.simulation.replay import Course, Steps, integrate, is_replayable
-from linkax.simulation.results import ENDED_WELL, RESULTS, AccuracyWarning, SimulationError, result_name
+from linkax.simulation.results import (
+    ENDED_WELL,
+    RESULTS,
+    AccuracyWarning,
+    SimulationError,
+    StiffnessWarning,
+    result_name,
+)
 from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
@@ -99,7 +106,8 @@ def simulate(
     far, where the run ends early: loops that do not close, numbers that are not finite,
     `max_steps` reached, a step size that falls to nothing. Derivatives of such a run are not a number.
     Warns (`AccuracyWarning`), outside JAX transformations, where rounding keeps the run from its tolerance: a body
-    carries one far longer, or branches of the motion are too close to each other.
+    carries one far longer, or branches of the motion are too close to each other. Warns likewise (`StiffnessWarning`)
+    where a stiff spring, damper or beam, and not the motion, chooses the steps, of which there are many.
     """
     dtype, t0, t1 = floating(dtype), checked_time(t0, "t0"), checked_time(t1, "t1")
     if known(t0) is not None and known(t1) is not None and not t1 > t0:
@@ -181,9 +189,12 @@ def simulate(
         in_doubt = uncertain_branch(found.closest, found.average)
         if result_name(solution.result) not in ENDED_WELL:
             if throw:
-                raise _failure(solution, state, in_doubt)
+                many = solution.result == RESULTS.max_steps_reached
+                raise _failure(solution, state, too_fast(solution, solver, t0) if many else in_doubt)
         elif why := lost_accuracy(mechanism, outset.definiteness, rtol) or in_doubt:
             warnings.warn(why.lstrip(), AccuracyWarning, stacklevel=2)
+        elif control.is_adaptive and (why := too_fast(solution, solver, t0)):
+            warnings.warn(why.lstrip(), StiffnessWarning, stacklevel=2)
     return solution
 
 
