@@ -1,5 +1,6 @@
 """Answers from elsewhere: the files in `data`, and closed forms."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +35,24 @@ def n_four_bar(times, count, gravity=9.81):
     m = 4 * c / (1 + 4 * c)
     sn, cn, _, _ = ellipj(times / 2 * np.sqrt(1 + 4 * c) - ellipk(m), m)
     return np.stack([-2 * cn * sn, 1 - 2 * cn**2], axis=-1)
+
+
+@functools.cache
+def rise_of_sarrus(angle, speed, duration):
+    """Angle of the legs of a Sarrus linkage (`mechanisms.raised`) after some time, from its one equation of motion."""
+    length, mass, width, platform, gravity = 0.5, 0.5, 0.02, 2.0, 9.81
+    own = mass * (length**2 + width**2) / 12.0
+    still = 4.0 * own + mass * length**2
+    turning = (4.0 * mass + 4.0 * platform) * length**2  # of cos², next to what stays
+    weight = gravity * length * (4.0 * mass + 2.0 * platform)
+
+    def rates(_, y):
+        cosine, sine = np.cos(y[0]), np.sin(y[0])
+        inertia = still + turning * cosine**2
+        return [y[1], (turning * cosine * sine * y[1] ** 2 - weight * cosine) / inertia]
+
+    found = solve_ivp(rates, (0.0, duration), [angle, speed], method="DOP853", rtol=3e-14, atol=1e-15)
+    return found.y[0, -1]
 
 
 def turning(parameters, forces=None):

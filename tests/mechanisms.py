@@ -54,6 +54,13 @@ def raised(angle, speeds):
     return mechanism, lx.assemble(mechanism, held, speeds, guess=guess)
 
 
+def raised_exactly(mechanism, angle, speed):
+    """The same as a state, without assembly: legs alike, with one speed [rad/s]."""
+    of_joint = {"base": (angle, speed), "knee": (np.pi - 2.0 * angle, -2.0 * speed), "top": (angle - np.pi, speed)}
+    of_coordinates = [of_joint[name.split("_")[0]] for name in mechanism.topology.coordinates]
+    return lx.State(*(np.array(part) for part in zip(*of_coordinates, strict=True)))
+
+
 def with_cut(mechanism, name):
     """The same mechanism with another joint cut."""
 

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from known_answers import reference, start
-from mechanisms import raised
+from known_answers import reference, rise_of_sarrus, start
+from mechanisms import raised, raised_exactly, sarrus
 from scipy.optimize import brentq
 from scipy.special import ellipeinc
 
@@ -172,6 +172,60 @@ def test_speeds_of_some_joints_are_completed_to_a_branch(asked):
     for name, speed in asked.items():
         assert speeds[name] == pytest.approx(speed, rel=1e-12)
     assert abs(speeds["base_x"]) == pytest.approx(abs(speeds["base_y"]), rel=1e-9)
+
+
+# At no height the rank falls by two, with straight legs by one; between, rows are neither clearly dependent nor not.
+DISTANCES = np.array([0.0, 1e-13, 1e-9, 1e-8, 1e-7, 5e-7, 1e-6, 2e-6, 4e-6, 1e-5, 1e-4, 1e-2])
+NEXT_TO = np.concatenate([angle + np.outer([1.0, -1.0], DISTANCES).ravel() for angle in (0.0, -np.pi / 2)])
+
+
+def errors_of_starts(states, angles, speeds, rtol, duration=0.3):
+    """Of both legs of Sarrus linkages after a run."""
+    mechanism, saveat = sarrus(), diffrax.SaveAt(ts=np.array([duration]))
+    run = lambda state: lx.simulate(
+        mechanism, state, t1=duration, accuracy=lx.Accuracy(rtol=rtol), saveat=saveat, throw=False
+    )
+    found = jax.vmap(run)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    assert np.all(found.result == lx.RESULTS.successful)
+    exact = [rise_of_sarrus(angle, speed, duration) for angle, speed in zip(angles, speeds, strict=True)]
+    legs = np.stack([found.joint(name)[:, 0] for name in ("base_x", "base_y")])
+    return np.max(np.abs(legs - exact), axis=0)
+
+
+@pytest.mark.parametrize("rtol", [pytest.param(1e-5, marks=pytest.mark.slow), 1e-8, 1e-12])
+def test_starts_at_any_distance_from_a_singular_configuration(rtol):
+    speeds = np.full(len(NEXT_TO), -5.0)
+    states = [raised_exactly(sarrus(), angle, -5.0) for angle in NEXT_TO]
+    assert np.max(errors_of_starts(states, NEXT_TO, speeds, rtol)) <= 100.0 * rtol
+
+
+def test_assembly_at_any_distance_from_a_singular_configuration():
+    """Where the position tells the branch, one speed tells all; closer, that of a knee is asked too."""
+    speed, states = -5.0, []
+    for angle in NEXT_TO:
+        told = np.min(np.abs(angle - np.array([0.0, -np.pi / 2]))) > 1e-9
+        asked = {"base_x": speed} if told else {"base_x": speed, "base_y": speed, "knee_x": -2.0 * speed}
+        states.append(raised(angle, asked)[1])
+        exact = raised_exactly(sarrus(), angle, speed)
+        np.testing.assert_allclose(states[-1].q, exact.q, atol=1e-14)
+        np.testing.assert_allclose(states[-1].v, exact.v, atol=3e-9)
+    assert np.max(errors_of_starts(states, NEXT_TO, np.full(len(NEXT_TO), speed), 1e-12)) <= 1e-10
+
+
+@pytest.mark.slow
+def test_many_starts_next_to_a_singular_configuration():
+    """Assembled from positions and speeds of all joints but one, or of few, from guesses next to them."""
+    generator, count, states = np.random.default_rng(2), 500, []
+    distances = generator.choice([-1.0, 1.0], count) * 10.0 ** generator.uniform(-14.0, -1.0, count)
+    angles = generator.choice([0.0, -np.pi / 2], count) + distances
+    speeds = generator.choice([-1.0, 1.0], count) * generator.uniform(0.5, 6.0, count)
+    for angle, distance, speed in zip(angles, distances, speeds, strict=True):
+        asked = {"base_x": speed, "base_y": speed}
+        if abs(distance) < 1e-7 or generator.integers(2):
+            asked |= {"knee_x": -2.0 * speed}
+        states.append(raised(angle, asked)[1])
+    for rtol in (1e-5, 1e-8, 1e-12):
+        assert np.max(errors_of_starts(states, angles, speeds, rtol)) <= 100.0 * rtol
 
 
 @pytest.mark.parametrize("rtol", [1e-8, 1e-12])

@@ -121,7 +121,7 @@ class ClassicalFormulation(AbstractFormulation):
         return Dynamics(acceleration, multipliers, at.jacobian @ acceleration - right)
 
     @traced_once
-    def derivative(self, system: System, t, q, v, correct: bool):
+    def derivative(self, system: System, t, q, v, correct):
         q = on_manifold(system.topology, q)
         solved = self._solved(coefficients(system, t, q), v)
         return v, solved.acceleration, q, jnp.ones((), q.dtype)

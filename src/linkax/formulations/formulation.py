@@ -65,11 +65,11 @@ class AbstractFormulation(eqx.Module):
         """Whether `correct` moves states to where the derivative is another one than before."""
 
     @abc.abstractmethod
-    def derivative(self, system: System, t, q, v, correct: bool):
+    def derivative(self, system: System, t, q, v, correct):
         """v, v̇, the coordinates that they hold at, and the distance d from the nearest singular configuration.
 
-        `correct`: put the state on the loops before the equations of motion are formed. d is one where the
-        formulation does not measure it.
+        `correct`: put the state on the loops before the equations of motion are formed; False, or a bool array. d is
+        one where the formulation does not measure it.
         """
 
     @abc.abstractmethod

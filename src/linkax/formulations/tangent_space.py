@@ -165,15 +165,16 @@ class TangentSpace(AbstractFormulation):
         opened = product(jnp.concatenate([along, none]))[len(change) :]
         return along - split.apply(jnp.zeros_like(change), opened)[0]
 
-    def _approximated(self, system, t, q, v):
-        """One factorisation, at q; then a fixed number of corrections with it."""
+    def _approximated(self, system, t, q, v, correct=True):
+        """One factorisation, at q; then a fixed number of corrections with it, of no change unless `correct`."""
         instant = coefficients(system, t, on_manifold(system.topology, q))
         split = self._split(instant)
         first = instant
         for _ in range(self.corrections):
             step = self._least_change(first, split, -residual(instant.configuration), sweeps=0)
+            step = jnp.where(correct, step, 0.0)
             instant = coefficients(system, t, retract(system.topology, instant.configuration.q, step))
-        v = self._on_velocity_level(instant, v, split, sweeps=2)
+        v = jnp.where(correct, self._on_velocity_level(instant, v, split, sweeps=2), v)
         return v, instant, split
 
     def _moved(self, instant, v, split, changes) -> Moved:
@@ -206,9 +207,9 @@ class TangentSpace(AbstractFormulation):
         return q, v, errors, split.distance
 
     @traced_once
-    def derivative(self, system: System, t, q, v, correct: bool):
+    def derivative(self, system: System, t, q, v, correct):
         """v and v̇ at (t, q, v), corrected before the equations of motion are formed, q and d there."""
-        found = _evaluated((self, system, t, q, v), correct and system.topology.num_rows > 0)
+        found = _evaluated((self, system, t, q, v), correct if system.topology.num_rows > 0 else False)
         return found.v, found.acceleration, found.q, found.split.distance
 
     def crossing(self, system: System, t, q) -> Crossing:
@@ -323,14 +324,14 @@ def _constant(tree):
 def _evaluated(arguments, correct) -> _Evaluated:
     """The acceleration at a state, or at the one on the loops next to it."""
     method, system, t, q, v = arguments
-    if correct:
-        v, instant, split = method._approximated(system, t, q, v)
-    else:
+    if correct is False:
         instant = coefficients(system, t, q)
         split = method._split(instant)
+    else:
+        v, instant, split = method._approximated(system, t, q, v, correct)
     motion = move(instant.configuration, v)
     sides = generalised_force(motion), gamma(motion)
-    acceleration, multipliers = method._solve(split, instant, *sides, sweeps=2 if correct else 1)
+    acceleration, multipliers = method._solve(split, instant, *sides, sweeps=1 if correct is False else 2)
     return _Evaluated(instant.configuration.q, v, acceleration, multipliers, split)
 
 
@@ -340,7 +341,7 @@ def _evaluated_jvp(primals, changes):
     method, system, t, _, _ = arguments
     found = _evaluated(arguments, correct)
     instant = coefficients(system, t, found.q)
-    state = method._moved(instant, found.v, found.split if correct else None, changes[1:])
+    state = method._moved(instant, found.v, None if correct is False else found.split, changes[1:])
     sides = unbalanced(state, found.acceleration, found.multipliers)
     acceleration, multipliers = method._solve(found.split, instant, *sides, sweeps=2)
     return found, _Evaluated(state.to_q, state.to_v, acceleration, multipliers, _constant(found.split))

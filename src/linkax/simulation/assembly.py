@@ -33,6 +33,7 @@ STEP_FRACTIONS = 0.5 ** np.arange(6)
 SMALL = 1e-15
 TURNS = 30  # of Newton's method for speeds: from close to where y² = x² is flat, each but halves the way
 BESIDE = 1e-2
+SEEN_ULPS = 100.0  # of rows that are not rounding alone
 CLOSED = 1e-9  # remaining gap, relative to the mechanism's length
 # Starts of the search beside the guess, by which it leaves a saddle of the gap, or a bad guess.
 ATTEMPTS = np.array([0.0, 1e-2, 1e-1, 0.3, 0.3, 0.6, 0.6, 1.0, 1.0, 1.0, 1.5, 1.5, 1.5, 1.5, 3.0, 3.0, 3.0, 3.0])
@@ -314,26 +315,28 @@ def _elastic_energy(system):
     return block_diag(*(beam.matrix for beam in _beams(system)))
 
 
-def _nearest(system, x, slopes, right):
+def _nearest(system, x, slopes, right, tolerance=None):
     """What is nearest to x, in radians and lengths of the mechanism, with slopes @ x = right.
 
-    Strains of beams differ from x, by as little energy as they can, only in what all else leaves open.
+    Strains of beams differ from x, by as little energy as they can, only in what all else leaves open. `tolerance`:
+    for independent rows, by default that of `BALANCED`.
     """
     strains, units = _strains(system), system.units
     if not len(strains):
-        return _nearest_in(None, units, x, slopes, right)
+        return _nearest_in(None, units, x, slopes, right, tolerance)
     others = np.setdiff1d(np.arange(len(units)), strains)
-    of_others = lambda x, right: _nearest_in(None, units[others], x, slopes[:, others], right)
+    of_others = lambda x, right: _nearest_in(None, units[others], x, slopes[:, others], right, tolerance)
     left = lambda right: right - slopes[:, others] @ of_others(jnp.zeros_like(x[others]), right)
     open_ = jax.vmap(left, in_axes=1, out_axes=1)(slopes[:, strains])
-    strained = _nearest_in(_elastic_energy(system), units[strains], x[strains], open_, left(right))
+    strained = _nearest_in(_elastic_energy(system), units[strains], x[strains], open_, left(right), tolerance)
     rest = of_others(x[others], right - slopes[:, strains] @ strained)
     return placed(placed(x, strains, strained), others, rest)
 
 
-def _nearest_in(metric, units, x, slopes, right):
+def _nearest_in(metric, units, x, slopes, right, tolerance=None):
     """What is nearest to x in a metric, or in units for None, with slopes @ x = right."""
-    inverse = invert(metric, slopes, units, BALANCED.method(x.dtype).rank_tolerance)
+    tolerance = BALANCED.method(x.dtype).rank_tolerance if tolerance is None else tolerance
+    inverse = invert(metric, slopes, units, tolerance)
     metric = jnp.diag(units**-2) if metric is None else metric
     return constrained_solve(inverse, metric, slopes, metric @ x, right)[0]
 
@@ -358,8 +361,12 @@ class _Asked(eqx.Module):
         return -jax.jacfwd(self.rest)(v)
 
     def least(self):
-        """The smallest speeds, on a branch or not."""
-        return _nearest(self.system, jnp.zeros_like(self.system.units), self.rows, self.right)
+        """The smallest speeds, on a branch or not; close to a singular configuration on the branch of the position."""
+        least = lambda tolerance: _nearest(self.system, jnp.zeros_like(units), self.rows, self.right, tolerance)
+        units = self.system.units
+        within = least(SEEN_ULPS * jnp.finfo(units.dtype).eps)
+        met = jnp.max(jnp.abs(self.right - self.rows @ within), initial=0.0) <= CLOSED
+        return jnp.where(met & (self.off_branch(within) <= BESIDE), within, least(None))
 
     def off_branch(self, v):
         """How far speeds are from a branch, relative to themselves."""

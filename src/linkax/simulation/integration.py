@@ -32,6 +32,7 @@ SEEN_ULPS = 512.0  # of estimates: rounding changes larger ones by less than a h
 SEEN = 1e-3  # of the tolerance, which is as small
 FIRST_STEP = 1e-3  # of the whole time
 FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
+FIRST_TURN_SINGULAR = 1e-3  # from a singular configuration, where the first stage does not know all of the loops
 SMALLEST_STEP_ULPS = 4.0
 MOST_RETRIES = 4
 FEASIBLE = 0.1  # of a step's first distance: what any step can keep from a passage
@@ -45,7 +46,8 @@ class Problem(eqx.Module):
 
     diffrax integrates one vector: q, v, and the time integral of the distance d from the nearest
     singular configuration, whose rates tell a step how close its stages came. From a state that
-    is not `sound`, no step is taken.
+    is not `sound`, no step is taken. At `closed_at` [s] the state is on the loops already: there a correction would
+    be rounding alone, which close to a singular configuration is amplified. `from_singular`: the run starts in one.
     """
 
     mechanism: Mechanism
@@ -53,6 +55,8 @@ class Problem(eqx.Module):
     method: AbstractFormulation
     accuracy: Accuracy
     sound: Bool[Array, ""] = True
+    closed_at: Float[Array, ""] = np.inf
+    from_singular: Bool[Array, ""] = False
 
     def packed(self, q, v, integral=0.0):
         """The vector that diffrax integrates."""
@@ -69,7 +73,7 @@ class Problem(eqx.Module):
 
     def derivative(self, t, y):
         """(q̇, v̇, d) for diffrax."""
-        correct = self.accuracy.projection in ("both", "stage")
+        correct = self.accuracy.projection in ("both", "stage") and t != self.closed_at
 
         def packed_rates(y):
             v, acceleration, q, distance = self.method.derivative(self.system, t, *self.unpacked(y), correct)
@@ -325,7 +329,8 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         if dt0 is None and self.is_adaptive:
             # Not diffrax's choice, which would compile the equations of motion twice more.
             fastest = jnp.max(jnp.abs(v / args.system.units), initial=0.0)
-            turning = jnp.where(fastest > 0.0, FIRST_TURN / jnp.where(fastest > 0.0, fastest, 1.0), jnp.inf)
+            most = jnp.where(args.from_singular, FIRST_TURN_SINGULAR, FIRST_TURN)
+            turning = jnp.where(fastest > 0.0, most / jnp.where(fastest > 0.0, fastest, 1.0), jnp.inf)
             dt0 = jnp.minimum(FIRST_STEP * (t1 - t0), turning)
             dt0 = lax.stop_gradient(dt0)
         first, state = self.controller.init(terms, t0, t1, (v, v), dt0, args, func, error_order)

@@ -21,8 +21,9 @@ ON_BRANCH = 10.0  # rank tolerances that speeds may be off a branch, relative to
 
 
 class Outset(NamedTuple):
-    """A state that motion starts from, put on the closed loops.
+    """A state that motion starts from at time t [s], put on the closed loops.
 
+    - `singular`: the rank of J is smaller here than next to here.
     - `rank`: of J at the states next to it along the motion, for each island of the mechanism, or each cell of its
       chain where it has one.
     - `definiteness`: of the mass matrix on the tangent space, see `linkax.linalg.constrained_solve.Inverse`.
@@ -31,7 +32,9 @@ class Outset(NamedTuple):
       branch of the motion; `unique`: so does, at rest, the acceleration.
     """
 
+    t: Float[Array, ""]
     state: State
+    singular: Bool[Array, ""]
     rank: Int[Array, " k"]
     definiteness: Float[Array, ""]
     assembled: Bool[Array, ""]
@@ -58,7 +61,7 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     to take any direction that J leaves; on a branch only if the loops have no force that turns it.
     """
     q, v = method.close(system, t, state.q, state.v)
-    start = State(q, v)
+    start, begins = State(q, v), lax.stop_gradient(t)
     # All that follows only decides, and has no derivative.
     method, system, t, given, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, state.q, q, v))
     # A singular mass matrix has spoiled them.
@@ -71,7 +74,8 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, acceleration, 0.0)))
     if system.topology.num_rows == 0:
         true = jnp.ones((), bool)
-        return Outset(start, crossing.inverse.rank, definiteness, assembled, finite, massive, true, true, true)
+        sound = assembled, finite, massive, true, true, true
+        return Outset(begins, start, jnp.zeros((), bool), crossing.inverse.rank, definiteness, *sound)
     gap = gaps(crossing.configuration)
     small = jnp.sqrt(eps)
     at_rest = crossing.fastest(v) ** 2 <= eps * crossing.fastest(acceleration)
@@ -80,7 +84,9 @@ def depart(method: TangentSpace, system: System, t, state: State) -> Outset:
     # Rows that are not quite dependent contradict each other by as much.
     on_branch = jnp.max(jnp.abs(off), initial=0.0) <= ON_BRANCH * method.rank_tolerance
     return Outset(
+        t=begins,
         state=start,
+        singular=jnp.any(rank > crossing.inverse.rank),
         rank=method.ranks_along(system, t, q, direction, rank),
         definiteness=definiteness,
         assembled=assembled,

@@ -270,7 +270,8 @@ def _problem(mechanism, accuracy, outset, formulation) -> Problem:
     method = accuracy.method(dtype) if formulation is None else formulation
     if isinstance(method, TangentSpace):
         method = eqx.tree_at(lambda m: m.rank_nearby, method, outset.rank, is_leaf=lambda leaf: leaf is None)
-    return Problem(mechanism, system_of(mechanism, dtype), method, accuracy, outset.sound)
+    start = outset.sound, outset.t, outset.singular
+    return Problem(mechanism, system_of(mechanism, dtype), method, accuracy, *start)
 
 
 def _saves_states(saveat) -> bool:
