@@ -28,7 +28,7 @@ from linkax.equations.motion import move
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import Accuracy
-from linkax.simulation.assembly import CLOSED, LONGEST_STEP
+from linkax.simulation.closing import CLOSED, LONGEST_STEP
 from linkax.simulation.given import checked_state, checked_time, marked
 from linkax.simulation.state import State
 from linkax.tracing import all_known, one_by_one, pushed_forward, runs_once

@@ -1,0 +1,101 @@
+"""Speeds that the loops allow, with some held; in a singular configuration on a branch of the motion."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from linkax.equations.loops import rate
+from linkax.equations.motion import move
+from linkax.formulations.branches import Crossing
+from linkax.simulation.accuracy import BALANCED
+from linkax.simulation.closing import CLOSED
+from linkax.simulation.given import Given
+from linkax.simulation.nearest import nearest
+from linkax.simulation.outset import ON_BRANCH
+from linkax.tracing import materialised, pushed_forward
+
+TURNS = 30  # of Newton's method: from close to where y² = x² is flat, each but halves the way
+BESIDE = 1e-2
+SEEN_ULPS = 100.0  # of rows that are not rounding alone
+
+
+class _Asked(eqx.Module):
+    """Speeds that the loops and a user ask for, over `scale`: rows @ v is `right`, and v is on a branch."""
+
+    crossing: Crossing
+    rows: jax.Array
+    right: jax.Array
+    scale: jax.Array
+
+    def rest(self, v):
+        """What speeds leave over."""
+        return jnp.concatenate([self.right - self.rows @ v, -self.crossing.off_branch(v, self.scale)])
+
+    @property
+    def system(self):
+        return self.crossing.configuration.system
+
+    def slopes(self, v):
+        return -jax.jacfwd(self.rest)(v)
+
+    def least(self):
+        """The smallest speeds, on a branch or not; close to a singular configuration on the branch of the position."""
+        least = lambda tolerance: nearest(self.system, jnp.zeros_like(units), self.rows, self.right, tolerance)
+        units = self.system.units
+        within = least(SEEN_ULPS * jnp.finfo(units.dtype).eps)
+        met = jnp.max(jnp.abs(self.right - self.rows @ within), initial=0.0) <= CLOSED
+        return jnp.where(met & (self.off_branch(within) <= BESIDE), within, least(None))
+
+    def off_branch(self, v):
+        """How far speeds are from a branch, relative to themselves."""
+        fastest = self.crossing.fastest(v)
+        off = jnp.max(jnp.abs(self.crossing.off_branch(v, self.scale)), initial=0.0)
+        return jnp.where(fastest > 0.0, off / jnp.where(fastest > 0.0, fastest, 1.0) ** 2, 0.0)
+
+
+@eqx.filter_custom_jvp
+def _on_branch(asked, v):
+    """Speeds on a branch, by Newton steps from a little beside speeds v, which may lie just between two."""
+    beside = BESIDE * jnp.sum(asked.crossing.inverse.basis, axis=1)
+    off = asked.off_branch(v) > ON_BRANCH * BALANCED.method(v.dtype).rank_tolerance
+    turn = lambda _, v: v + nearest(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
+    # As many each time: with a loop that ends sooner XLA (jaxlib 0.10) finds no callbacks in the rest of the program.
+    return lax.fori_loop(0, TURNS, turn, v + jnp.where(off, beside, 0.0))
+
+
+@_on_branch.def_jvp
+def _on_branch_jvp(primals, changes):
+    """Where nothing is left over, to any order: the Newton steps have no derivative."""
+    (asked, begin), (change, begins) = primals, changes
+    v = _on_branch(asked, begin)
+    opens = pushed_forward(lambda asked: asked.rest(v), (asked,), (change,))[1]
+    return v, nearest(asked.system, materialised(v, begins), asked.slopes(v), opens)
+
+
+def speeds_on_branch(configuration, held):
+    """The smallest speeds with those of joints held, or near to them on a branch of the motion.
+
+    Speeds satisfy J v = b, and γ(v, v) is in the range of J; where the rank of J is constant, the
+    smallest do.
+
+    **Returns:** speeds, (n_v,); how far the smallest speeds that the loops allow are from those held, by
+    joint; and how far the speeds are from such a branch, relative to themselves.
+    """
+    system = configuration.system
+    crossing = Crossing.of(configuration, BALANCED.method(system.dtype).rank_tolerance)
+    of_joints = lambda v: held.speeds(move(configuration, v))
+    right = jnp.concatenate([rate(system, configuration.t), *held.values])
+    largest = jnp.max(jnp.abs(right), initial=0.0)
+    scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
+    still = jnp.zeros(system.topology.num_speeds, system.dtype)
+    rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(of_joints)(still)])
+    asked = _Asked(crossing, rows, right / scale, scale)
+    least = asked.least()
+    v = _on_branch(asked, least)
+    missed = jnp.max(jnp.abs(asked.right - rows @ v), initial=0.0)
+    # What the loops leave of them: a row that is nearly none opens little, and yet may allow no motion at all.
+    opened = crossing.jacobian @ least - asked.right[: crossing.jacobian.shape[0]]
+    reached = zip(of_joints(scale * (least - crossing.inverse.normal @ opened)), held.values, strict=True)
+    misses = Given(held.terms, tuple(found - entry for found, entry in reached))
+    return scale * v, misses, jnp.maximum(asked.off_branch(v), missed)
