@@ -14,7 +14,7 @@ from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import BALANCED
-from linkax.simulation.branch_speeds import speeds_on_branch
+from linkax.simulation.branch_speeds import other_speeds, speeds_on_branch
 from linkax.simulation.closing import CLOSED, Demand, closed
 from linkax.simulation.given import Given, by_joint, check_mechanism, checked_time, coordinates_by_joint, sound_numbers
 from linkax.simulation.nearest import beams_of
@@ -28,7 +28,7 @@ class AssemblyError(ValueError):
 
 
 class AssemblyWarning(UserWarning):
-    """The loops of a mechanism close only where beams are strained."""
+    """The loops of a mechanism close only where beams are strained, or leave open on which branch it moves."""
 
 
 def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t=0.0) -> State:
@@ -49,8 +49,8 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     and in lengths of the mechanism. Where the search does not get from the guess to closed loops,
     it starts again beside it, a little and then farther. Strains of beams stay as guessed, by default
     zero; where no start leads to closed loops so, they change, with little energy. In a singular
-    configuration, where branches of the motion cross, speeds lie on the branch nearest to these; give
-    more of them to choose another.
+    configuration, where branches of the motion cross, speeds lie on that of the position where it is a little off
+    (1e-9), else on the branch nearest to these; give more of them to choose another.
 
     Derivatives by numbers of the mechanism, positions and speeds given, and the guess, to any order: of
     coordinates that are not held and that the loops leave free, those of the nearest to the guess, as if
@@ -60,7 +60,8 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
     raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
-    Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain.
+    Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain, and of speeds that
+    fit several branches.
     """
     check_mechanism(mechanism)
     t = jnp.asarray(checked_time(t, "t"))
@@ -85,7 +86,22 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
                 AssemblyWarning,
                 stacklevel=2,
             )
+    if remainder.undecided and (names := _open_speeds(mechanism, speeds, t, state)):
+        warnings.warn(
+            f"the configuration is singular, and the speeds asked fit several branches of the motion, which differ in "
+            f"the speeds of joints {names}; to choose a branch, ask for the speeds of some of these, too",
+            AssemblyWarning,
+            stacklevel=2,
+        )
     return state
+
+
+def _open_speeds(mechanism, speeds, t, state):
+    """Names of joints that move otherwise on other branches with the speeds asked."""
+    others, are_some = other_speeds(mechanism, speeds, t, state.q, state.v)
+    differences = (others - state.v)[np.asarray(are_some)].T
+    names = moving_joints(system_of(mechanism, state.q.dtype), t, state.q, differences) if differences.size else ()
+    return ", ".join(map(repr, names))
 
 
 def _raise_if_open(mechanism, state, t, remainder):
@@ -131,6 +147,7 @@ class _Remainder(eqx.Module):
     positions: Given
     speeds: Given
     off_branch: jax.Array
+    undecided: jax.Array
     strained: dict
 
     @property
@@ -159,13 +176,14 @@ def _assemble(mechanism, positions, speeds, guess, t):
     q = closed(demand, begin)
     off = jnp.abs(demand.back(q, begin))
     configuration = configure(system, t, q)
-    v, misses, off_branch = speeds_on_branch(configuration, speeds)
+    v, misses, off_branch, undecided = speeds_on_branch(configuration, speeds)
     remainder = _Remainder(
         gap=gaps(configuration),
         length=system.length,
         positions=Given(positions.terms, demand.misses(configuration)),
         speeds=misses,
         off_branch=off_branch,
+        undecided=undecided,
         strained={
             beam.beam: (jnp.max(off[topology.speeds[beam.beam]]), beam.energy(q[topology.coordinates[beam.beam]]))
             for beam in beams_of(system)

@@ -3,21 +3,28 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
+from linkax.equations.configuration import configure
 from linkax.equations.loops import rate
 from linkax.equations.motion import move
+from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
+from linkax.linalg.constrained_solve import invert
 from linkax.simulation.accuracy import BALANCED
 from linkax.simulation.closing import CLOSED
 from linkax.simulation.given import Given
 from linkax.simulation.nearest import nearest
 from linkax.simulation.outset import ON_BRANCH
-from linkax.tracing import materialised, pushed_forward
+from linkax.tracing import materialised, pushed_forward, runs_once
 
 TURNS = 30  # of Newton's method: from close to where y² = x² is flat, each but halves the way
 BESIDE = 1e-2
 SEEN_ULPS = 100.0  # of rows that are not rounding alone
+STARTS = 12  # from which other branches are looked for
+SPREAD = 4.0  # of these, next to the speeds asked
+APART = 1e-3  # of the largest speed: what tells branches apart
 
 
 class _Asked(eqx.Module):
@@ -39,13 +46,31 @@ class _Asked(eqx.Module):
     def slopes(self, v):
         return -jax.jacfwd(self.rest)(v)
 
+    def next_to(self, v, tolerance=None):
+        """The nearest speeds that satisfy the rows, on a branch or not."""
+        return nearest(self.system, v, self.rows, self.right, tolerance)
+
+    def missed(self, v):
+        """How far speeds are from those asked."""
+        return jnp.max(jnp.abs(self.right - self.rows @ v), initial=0.0)
+
+    def aside(self, count):
+        """Other speeds that satisfy the rows, on a branch or not, (count, n_v)."""
+        anywhere = SPREAD * np.random.default_rng(0).normal(size=(count, len(self.system.units)))
+        return jax.vmap(self.next_to)(jnp.asarray(anywhere, self.right.dtype) * self.system.units)
+
     def least(self):
-        """The smallest speeds, on a branch or not; close to a singular configuration on the branch of the position."""
-        least = lambda tolerance: nearest(self.system, jnp.zeros_like(units), self.rows, self.right, tolerance)
-        units = self.system.units
-        within = least(SEEN_ULPS * jnp.finfo(units.dtype).eps)
-        met = jnp.max(jnp.abs(self.right - self.rows @ within), initial=0.0) <= CLOSED
-        return jnp.where(met & (self.off_branch(within) <= BESIDE), within, least(None))
+        """The smallest speeds, on a branch or not; close to a singular configuration on the branch of the position.
+
+        Also whether other branches may cross there, of which the position does not tell.
+        """
+        least, units = self.next_to(jnp.zeros_like(self.system.units)), self.system.units
+        within = self.next_to(jnp.zeros_like(units), SEEN_ULPS * jnp.finfo(units.dtype).eps)
+        off = jax.vmap(self.off_branch)(jnp.stack([within, self.aside(1)[0]]))
+        told = (self.missed(within) <= CLOSED) & (off[0] <= BESIDE)
+        told_apart = told & (self.crossing.fastest(within - least) > APART * self.crossing.fastest(within))
+        moves = jnp.max(jnp.abs(self.right), initial=0.0) > 0.0
+        return jnp.where(told, within, least), moves & (off[1] > BESIDE) & jnp.logical_not(told_apart)
 
     def off_branch(self, v):
         """How far speeds are from a branch, relative to themselves."""
@@ -73,6 +98,17 @@ def _on_branch_jvp(primals, changes):
     return v, nearest(asked.system, materialised(v, begins), asked.slopes(v), opens)
 
 
+def _asked(configuration, held):
+    system = configuration.system
+    crossing = Crossing.of(configuration, BALANCED.method(system.dtype).rank_tolerance)
+    right = jnp.concatenate([rate(system, configuration.t), *held.values])
+    largest = jnp.max(jnp.abs(right), initial=0.0)
+    scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
+    still = jnp.zeros(system.topology.num_speeds, system.dtype)
+    rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(lambda v: held.speeds(move(configuration, v)))(still)])
+    return _Asked(crossing, rows, right / scale, scale)
+
+
 def speeds_on_branch(configuration, held):
     """The smallest speeds with those of joints held, or near to them on a branch of the motion.
 
@@ -80,22 +116,32 @@ def speeds_on_branch(configuration, held):
     smallest do.
 
     **Returns:** speeds, (n_v,); how far the smallest speeds that the loops allow are from those held, by
-    joint; and how far the speeds are from such a branch, relative to themselves.
+    joint; how far the speeds are from such a branch, relative to themselves; and whether there may be others.
     """
-    system = configuration.system
-    crossing = Crossing.of(configuration, BALANCED.method(system.dtype).rank_tolerance)
-    of_joints = lambda v: held.speeds(move(configuration, v))
-    right = jnp.concatenate([rate(system, configuration.t), *held.values])
-    largest = jnp.max(jnp.abs(right), initial=0.0)
-    scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
-    still = jnp.zeros(system.topology.num_speeds, system.dtype)
-    rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(of_joints)(still)])
-    asked = _Asked(crossing, rows, right / scale, scale)
-    least = asked.least()
+    asked = _asked(configuration, held)
+    crossing, scale = asked.crossing, asked.scale
+    least, undecided = asked.least()
     v = _on_branch(asked, least)
-    missed = jnp.max(jnp.abs(asked.right - rows @ v), initial=0.0)
     # What the loops leave of them: a row that is nearly none opens little, and yet may allow no motion at all.
     opened = crossing.jacobian @ least - asked.right[: crossing.jacobian.shape[0]]
-    reached = zip(of_joints(scale * (least - crossing.inverse.normal @ opened)), held.values, strict=True)
-    misses = Given(held.terms, tuple(found - entry for found, entry in reached))
-    return scale * v, misses, jnp.maximum(asked.off_branch(v), missed)
+    reached = held.speeds(move(configuration, scale * (least - crossing.inverse.normal @ opened)))
+    misses = Given(held.terms, tuple(found - entry for found, entry in zip(reached, held.values, strict=True)))
+    return scale * v, misses, jnp.maximum(asked.off_branch(v), asked.missed(v)), undecided
+
+
+@runs_once
+def other_speeds(mechanism, held, t, q, v):
+    """Speeds on other branches than v, with those of joints held: candidates, (k, n_v), and which of them are some."""
+    configuration = configure(system_of(mechanism, q.dtype), t, q)
+    asked = _asked(configuration, held)
+    tolerance = BALANCED.method(q.dtype).rank_tolerance
+
+    def found(begin):
+        other = _on_branch(asked, begin)
+        off = jnp.maximum(asked.off_branch(other), asked.missed(other))
+        # Speeds beside it on its own branch differ, too, where more than what is asked can move.
+        decided = invert(None, asked.slopes(other), asked.system.units, tolerance).rank == len(v)
+        apart = asked.crossing.fastest(asked.scale * other - v) > APART * asked.crossing.fastest(v)
+        return asked.scale * other, (off <= ON_BRANCH * tolerance) & decided & apart
+
+    return lax.map(found, asked.aside(STARTS))
