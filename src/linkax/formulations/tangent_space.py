@@ -217,6 +217,13 @@ class TangentSpace(AbstractFormulation):
         instant = coefficients(system, t, q)
         return Crossing(instant.configuration, instant.jacobian, self._split_at_once(instant))
 
+    def right_inverse(self, system: System, t, q):
+        """J, (m, n_v), a right inverse G of its independent rows, (n_v, m), and d at coordinates q."""
+        instant = coefficients(system, t, q)
+        split, (rows, n) = self._split(instant), instant.jacobian.shape
+        column = lambda gamma: split.apply(jnp.zeros(n, gamma.dtype), gamma)[0]
+        return instant.jacobian, jax.vmap(column, out_axes=1)(jnp.eye(rows, dtype=q.dtype)), split.distance
+
     def distance(self, system: System, t, q) -> Float[Array, ""]:
         """The distance d from the nearest singular configuration, with derivatives."""
         instant = coefficients(system, t, q)

@@ -114,13 +114,18 @@ def _passages(solution) -> list[_Found]:
     turned = [_turned(values) for values in _between(solution, pairs, np.ones(len(pairs.ts)))[0]]
     pairs = pairs.taken(np.repeat(np.arange(len(turned)), [len(ends) for ends in turned]))
     places, distances, states = _zeros(solution, pairs, np.concatenate([np.empty(0), *turned]))
-    vanished = distances <= VANISHED * np.max(pairs.distances, axis=1)
+    vanished = np.flatnonzero(distances <= VANISHED * np.max(pairs.distances, axis=1))
     times = pairs.ts[:, 0] + places * np.diff(pairs.ts, axis=1)[:, 0]
-    found = [_polished(solution, pairs.taken(k), times[k], states[k]) for k in np.flatnonzero(vanished)]
-    found.sort(key=lambda passage: passage.time)
-    whole = TOGETHER * np.ptp(samples.ts)
-    apart = [k for k in range(len(found)) if k == 0 or found[k].time - found[k - 1].time > whole]
-    return [found[k] for k in apart]
+    together = TOGETHER * np.ptp(samples.ts)
+    different = vanished[_apart(times[vanished], together)]
+    found = [_polished(solution, pairs.taken(k), times[k], states[k]) for k in different]
+    return [found[k] for k in _apart(np.array([passage.time for passage in found]), together)]
+
+
+def _apart(times, together):
+    """The first of each times that lie together, in order."""
+    order = np.argsort(times)
+    return order[np.diff(times[order], prepend=-np.inf) > together]
 
 
 def _close_enough(solution) -> Samples:
@@ -239,9 +244,8 @@ def between_states(mechanism, accuracy, rank_nearby, ts, qs, vs, places):
             k1=duration * rates(system.topology, qs[1], vs[1]),
         )
         q = on_manifold(system.topology, hermite.evaluate(place))
-        here = method.crossing(system, ts[0] + place * duration, q)
-        before = method.crossing(system, ts[0], qs[0])
-        right_inverse = before.inverse.normal
-        return here.jacobian @ right_inverse, before.jacobian @ right_inverse, here.inverse.distance, q
+        here, _, distance = method.right_inverse(system, ts[0] + place * duration, q)
+        before, right_inverse, _ = method.right_inverse(system, ts[0], qs[0])
+        return here @ right_inverse, before @ right_inverse, distance, q
 
     return jax.vmap(at)(ts, qs, vs, places)
