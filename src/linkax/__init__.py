@@ -85,6 +85,7 @@ from linkax.simulation.assembly import assemble as assemble  # noqa: E402
 from linkax.simulation.instant import Pose as Pose  # noqa: E402
 from linkax.simulation.instant import Power as Power  # noqa: E402
 from linkax.simulation.instant import Violation as Violation  # noqa: E402
+from linkax.simulation.results import REMARKS as REMARKS  # noqa: E402
 from linkax.simulation.results import RESULTS as RESULTS  # noqa: E402
 from linkax.simulation.results import AccuracyWarning as AccuracyWarning  # noqa: E402
 from linkax.simulation.results import SimulationError as SimulationError  # noqa: E402

@@ -1,4 +1,4 @@
-"""Why a simulation failed: the elements to blame, found on the host after the run."""
+"""Why a simulation failed, or is not to be relied upon: the elements to blame, found after the run."""
 
 import diffrax
 import equinox as eqx
@@ -15,10 +15,12 @@ from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
 from linkax.formulations.classical import ClassicalFormulation
 from linkax.linalg.constrained_solve import invert
+from linkax.linalg.spectral_radius import spectral_radius
+from linkax.linalg.triangular import cholesky_inverse
 from linkax.model.constraints import Drive
 from linkax.simulation.outset import MOVES, moving_joints
-from linkax.simulation.results import RESULTS
-from linkax.tracing import runs_once
+from linkax.simulation.results import ENDED_WELL, REMARKS, RESULTS
+from linkax.tracing import all_known, runs_once
 
 AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
 OPEN_ULPS = 1e3  # that loops are open where constraints contradict each other
@@ -163,75 +165,167 @@ def _widest(system, mechanism, t, q):
     return names[widest], float(sizes[widest])
 
 
-def lost_accuracy(mechanism, definiteness, rtol) -> str:
-    """A sentence on accelerations that rounding keeps from the tolerance, or nothing.
-
-    **Arguments:** `definiteness`: of the mass matrix, see `linkax.linalg.constrained_solve.Inverse`.
-    """
-    eps = jnp.finfo(definiteness.dtype).eps
-    rounding = eps / float(definiteness)
-    if rounding <= max(UNSEEN * float(rtol), UNSEEN_ULPS * eps):
-        return ""
-    system = system_of(mechanism, definiteness.dtype)
-    why = _lost_inertia(system, below=TO_BLAME * float(definiteness))
-    many = " Some bodies carry others far larger, or very many; ask for a larger rtol."
-    off = f" Rounding alone puts accelerations off by {rounding:.0e} of their size, and rtol is {float(rtol):.0e}."
-    return off + (why or many)
+def remark(solution) -> REMARKS:
+    """What there is to say of a run that ended well, or of each of a batch: the first of `REMARKS` that applies."""
+    known, found = _known(solution), np.zeros(solution.t_end.shape, np.int32)
+    numeric = np if known is np.asarray else jnp
+    if solution.repeat is not None:  # else it is no run
+        well = numeric.isin(known(solution.result._value), _WELL)
+        for name, (applies, _) in reversed(_FINDINGS.items()):
+            found = numeric.where(well & applies(solution, known), getattr(REMARKS, name)._value, found)
+    # An entry of an array of NumPy would be none of an enumeration.
+    return type(REMARKS.none)(jnp.asarray(found, jnp.int32) if found.shape else found, REMARKS)
 
 
-def uncertain_branch(closest, average) -> str:
-    """A sentence on branches of motion that rounding may confuse, or nothing.
-
-    **Arguments:** the smallest and the mean distance from a singular configuration.
-    """
-    info = jnp.finfo(closest.dtype)
-    closest, average = float(closest), float(average)
-    if info.bits < 64 and closest < PASSES:
-        return (
-            f" The motion passes a singular configuration, where branches of motion cross, at a distance of "
-            f"{closest:.0e}: rounding of single precision may move it to another; compare with double precision."
-        )
-    if STAYS_ULPS * info.eps < average < LINGERS:
-        return (
-            f" The motion does not leave a singular configuration, where branches of motion cross, by more than about "
-            f"{average:.0e}: rounding may move it from one to another, which puts it off by more than that."
-        )
+def in_words(solution, *names) -> str:
+    """The first of these `REMARKS` that applies to a run, ended well or not, with numbers and elements; or nothing."""
+    for applies, tell in map(_FINDINGS.get, names):
+        if applies(solution, np.asarray):
+            return tell(solution)
     return ""
 
 
-def too_fast(solution, solver, t0) -> str:
-    """A sentence on the element whose rate, and not the motion, chooses the steps, or nothing."""
-    count, duration = int(solution.stats["num_steps"]), float(solution.t_end - t0)
-    if solution.v is None or count < MANY_STEPS:
-        return ""
-    system, step = system_of(solution.mechanism, solution.v.dtype), duration / count
-    turns = np.max(np.abs(solution.v / system.units), axis=1, initial=0.0)[np.isfinite(solution.ts)]
-    if not len(turns) or not np.mean(turns) * step < SHORT:
-        return ""
-    gram, *matrices = map(np.asarray, _elements(solution.mechanism, solution.accuracy, solution.t_end, solution.end))
-    moves = np.diagonal(gram) > 0.0
-    to_speeds = np.linalg.inv(np.linalg.cholesky(gram[np.ix_(moves, moves)]))
-    largest = lambda of: np.max(
-        np.abs(np.linalg.eigvals(to_speeds @ of[:, moves][:, :, moves] @ to_speeds.T)), axis=1, initial=0.0
+def _known(solution):
+    """Numbers of a run as NumPy's, which compile nothing, unless they are traced."""
+    found = solution.t_end, solution.v, solution.stats, solution.result, solution.average, solution.definiteness
+    return np.asarray if all_known(found) else jnp.asarray
+
+
+def _loses_accuracy(solution, known):
+    """Whether rounding keeps accelerations from the tolerance."""
+    definiteness, eps = known(solution.definiteness), jnp.finfo(solution.definiteness.dtype).eps
+    seen = UNSEEN_ULPS * definiteness < 1.0
+    if known is np.asarray and not np.any(seen):
+        return seen
+    return seen & (eps > UNSEEN * definiteness * known(_rtol(solution)))
+
+
+def _rtol(solution):
+    rtol, _ = solution.repeat.control.tolerances((solution.accuracy.rtol, None))
+    return rtol
+
+
+def _lost_accuracy(solution):
+    definiteness, rtol = float(solution.definiteness), float(_rtol(solution))
+    system = system_of(solution.mechanism, solution.definiteness.dtype)
+    why = _lost_inertia(system, below=TO_BLAME * definiteness)
+    many = " Some bodies carry others far larger, or very many; ask for a larger rtol."
+    rounding = jnp.finfo(system.dtype).eps / definiteness
+    off = f" Rounding alone puts accelerations off by {rounding:.0e} of their size, and rtol is {rtol:.0e}."
+    return off + (why or many)
+
+
+def _passes(solution, known):
+    """Whether branches cross closer than single precision tells them apart."""
+    closest = known(solution.closest)
+    return (closest < PASSES) & (jnp.finfo(closest.dtype).bits < 64)
+
+
+def _passed(solution):
+    return (
+        f" The motion passes a singular configuration, where branches of motion cross, at a distance of "
+        f"{float(solution.closest):.0e}: rounding of single precision may move it to another; compare with double "
+        "precision."
     )
-    stiffness, damping = map(largest, matrices)
-    rates = np.maximum(np.sqrt(stiffness), damping)
+
+
+def _lingers(solution, known):
+    """Whether rounding may confuse the branches that the motion is close to all the time."""
+    average = known(solution.average)
+    return (average > STAYS_ULPS * jnp.finfo(average.dtype).eps) & (average < LINGERS)
+
+
+def _lingered(solution):
+    return (
+        f" The motion does not leave a singular configuration, where branches of motion cross, by more than about "
+        f"{float(solution.average):.0e}: rounding may move it from one to another, which puts it off by more than that."
+    )
+
+
+def _is_stiff(solution, known):
+    """Whether the rate of an element, and not the motion, chooses the steps; rates are found where steps are many."""
+    never = np.zeros(solution.t_end.shape, bool)
+    suspect = known(solution.stats["num_steps"]) >= MANY_STEPS
+    if solution.v is None or not solution.mechanism.forces or (known is np.asarray and not np.any(suspect)):
+        return never
+    if not solution.repeat.control.is_adaptive:
+        return never
+    step = known(_mean_step(solution))
+    suspect = suspect & (known(_mean_speed(solution)) * step < SHORT)
+    if known is np.asarray and not np.any(suspect):
+        return never
+    turned = known(jnp.max(_rates(*_ends(solution)), axis=-1)) * step
+    is_implicit = isinstance(solution.repeat.solver, diffrax.AbstractImplicitSolver)
+    return suspect & (turned > FAST) & (turned < (RESOLVED if is_implicit else np.inf))
+
+
+def _stiff(solution):
+    rates, step = np.asarray(_rates(*_ends(solution))), float(_mean_step(solution))
     fastest = int(np.argmax(rates))
-    turned, implicit = rates[fastest] * step, isinstance(solver, diffrax.AbstractImplicitSolver)
-    if not (FAST < turned < RESOLVED if implicit else turned > FAST):
-        return ""
     explicit = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
     rigid = (
         "take a rigid joint or constraint in its place, or, where it has come to rest or the tolerance is loose, "
         "solver=diffrax.Kvaerno5()"
     )
+    advice = explicit if isinstance(solution.repeat.solver, diffrax.AbstractImplicitSolver) else rigid
     return (
         f" {solution.mechanism.forces[fastest].described}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not the "
-        f"motion, chooses the {count} steps, {step:.1e} s each; {explicit if implicit else rigid}."
+        f"motion, chooses the {int(solution.stats['num_steps'])} steps, {step:.1e} s each; {advice}."
     )
 
 
+_WELL = np.array([getattr(RESULTS, name)._value for name in ENDED_WELL])
+# Of each of `REMARKS`, the first to be told first: whether it applies, and what there is to say.
+_FINDINGS = {
+    "rounding": (_loses_accuracy, _lost_accuracy),
+    "single_precision": (_passes, _passed),
+    "lingers": (_lingers, _lingered),
+    "stiff": (_is_stiff, _stiff),
+}
+
+
+def _mean_step(solution):
+    _, t0 = solution.repeat.start
+    return (solution.t_end - t0) / jnp.maximum(solution.stats["num_steps"], 1)
+
+
+def _mean_speed(solution):
+    """Of the fastest joint, over saved times; not a number where none was reached."""
+    units = _per_member(_units, *_ends(solution))
+    turns, reached = jnp.max(jnp.abs(solution.v / units[..., None, :]), axis=-1, initial=0.0), jnp.isfinite(solution.ts)
+    return jnp.sum(jnp.where(reached, turns, 0.0), axis=-1) / jnp.sum(reached, axis=-1)
+
+
+def _ends(solution):
+    return solution.mechanism, solution.accuracy, solution.t_end, solution.end
+
+
+def _per_member(function, mechanism, accuracy, t, state):
+    """Of what is at the end of a run, or of each of a batch."""
+    for _ in range(t.ndim):
+        function = eqx.filter_vmap(function)
+    return function(mechanism, accuracy, t, state)
+
+
+def _units(mechanism, accuracy, t, state):
+    return system_of(mechanism, state.q.dtype).units
+
+
 @runs_once
+def _rates(mechanism, accuracy, t, state):
+    """The fastest rate of each force element [1/s], (..., n): √(k / m) or c / m."""
+    return _per_member(_rates_of_elements, mechanism, accuracy, t, state)
+
+
+def _rates_of_elements(mechanism, accuracy, t, state):
+    gram, *matrices = _elements(mechanism, accuracy, t, state)
+    stays = jnp.diagonal(gram) <= 0.0
+    to_speeds, _ = cholesky_inverse(gram + jnp.diag(stays.astype(gram.dtype)))
+    largest = lambda of: spectral_radius(to_speeds @ of @ to_speeds.T)
+    stiffness, damping = map(largest, matrices)
+    return jnp.maximum(jnp.sqrt(stiffness), damping)
+
+
 def _elements(mechanism, accuracy, t, state):
     """Masses in directions that the loops leave, stiffness and damping there of each force element, (n, n_v, n_v)."""
     system = system_of(mechanism, state.q.dtype)

@@ -77,10 +77,19 @@ class Repeat(eqx.Module):
         return eqx.combine(self.arrays, self.rest)[:2]
 
     @property
+    def solver(self) -> diffrax.AbstractSolver:
+        """Of the run."""
+        return eqx.combine(self.arrays, self.rest)[3]
+
+    @property
+    def control(self) -> MechanismControl:
+        """Of the run's steps."""
+        return MechanismControl(eqx.combine(self.arrays, self.rest)[4])
+
+    @property
     def has_parts(self) -> bool:
         """Whether a part of the motion can be run by itself: not where the steps themselves are given."""
-        controller = eqx.combine(self.arrays, self.rest)[4]
-        return not isinstance(MechanismControl(controller).innermost, diffrax.StepTo)
+        return not isinstance(self.control.innermost, diffrax.StepTo)
 
     def _run(self, solution, state, **options):
         formulation = solution.formulation

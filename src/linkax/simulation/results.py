@@ -1,6 +1,7 @@
 """How a simulation ended."""
 
 import diffrax
+import equinox as eqx
 
 
 class RESULTS(diffrax.RESULTS):
@@ -67,12 +68,47 @@ def result_name(result) -> str:
     return "failed"
 
 
+def remark_name(remark) -> str:
+    """The name of a remark, such as "none" or "stiff"."""
+    return next((name for name in WARNINGS if remark._value == getattr(REMARKS, name)._value), "none")
+
+
+class REMARKS(eqx.Enumeration):
+    """What there is to say of a simulation that ended well: of the first that applies a single run warns."""
+
+    none = ""
+    rounding = (
+        "Rounding alone puts accelerations off by more than the tolerance: a body carries one far larger, or very "
+        "many. Ask for a larger rtol, or cut a joint so that another body carries it."
+    )
+    single_precision = (
+        "The motion passes a singular configuration, where branches of motion cross, and rounding of single precision "
+        "may move it to another; compare with double precision."
+    )
+    lingers = (
+        "The motion does not leave a singular configuration, where branches of motion cross: rounding may move it from "
+        "one to another."
+    )
+    stiff = (
+        "A stiff spring, damper or beam, and not the motion, chooses the steps. Take a rigid joint or constraint in "
+        "its place, or, with an explicit solver, solver=diffrax.Kvaerno5()."
+    )
+
+
 class AccuracyWarning(UserWarning):
     """A simulation that rounding keeps from the tolerance asked for; `Solution.error_estimate` tells how far."""
 
 
 class StiffnessWarning(UserWarning):
     """A simulation whose steps one fast element chooses, and not the motion."""
+
+
+WARNINGS = {
+    "rounding": AccuracyWarning,
+    "single_precision": AccuracyWarning,
+    "lingers": AccuracyWarning,
+    "stiff": StiffnessWarning,
+}
 
 
 class SimulationError(RuntimeError):

@@ -128,8 +128,17 @@ def _joined(parts) -> Solution:
         stats=parts[-1].stats | counted,
         rank_nearby=np.max([part.rank_nearby for part in parts], axis=0),
         closest=min(part.closest for part in parts),
+        average=_mean_distance(parts),
+        definiteness=parts[0].definiteness,
         repeat=parts[0].repeat,
     )
+
+
+def _mean_distance(parts):
+    """Over the time of all parts, from a singular configuration."""
+    lasting = [part for part in parts if part.t_end > part.ts[0]]
+    durations = [part.t_end - part.ts[0] for part in lasting]
+    return np.average([part.average for part in lasting], weights=durations) if lasting else parts[0].average
 
 
 def _thinned(parts, name):

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool
 
 from linkax.equations.system import system_of
@@ -18,7 +19,7 @@ from linkax.model.functions import Function
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import flag, instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.diagnosis import cause, lost_accuracy, too_fast, uncertain_branch
+from linkax.simulation.diagnosis import cause, in_words
 from linkax.simulation.given import check_accuracy, checked_state, checked_time, sound_numbers
 from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.options import (
@@ -35,9 +36,9 @@ from linkax.simulation.replay import Course, Steps, integrate, is_replayable
 from linkax.simulation.results import (
     ENDED_WELL,
     RESULTS,
-    AccuracyWarning,
+    WARNINGS,
     SimulationError,
-    StiffnessWarning,
+    remark_name,
     result_name,
 )
 from linkax.simulation.rows import over_rows
@@ -107,7 +108,8 @@ def simulate(
     `max_steps` reached, a step size that falls to nothing. Derivatives of such a run are not a number.
     Warns (`AccuracyWarning`), outside JAX transformations, where rounding keeps the run from its tolerance: a body
     carries one far longer, or branches of the motion are too close to each other. Warns likewise (`StiffnessWarning`)
-    where a stiff spring, damper or beam, and not the motion, chooses the steps, of which there are many.
+    where a stiff spring, damper or beam, and not the motion, chooses the steps, of which there are many. Inside of
+    them `solution.remark()` says so, see `linkax.REMARKS`.
     """
     dtype, t0, t1 = floating(dtype), checked_time(t0, "t0"), checked_time(t1, "t1")
     if known(t0) is not None and known(t1) is not None and not t1 > t0:
@@ -179,22 +181,19 @@ def simulate(
         result=found.result,
         rank_nearby=outset.rank,
         closest=found.closest,
+        average=found.average,
+        definiteness=outset.definiteness,
         interpolation=found.interpolation,
         repeat=Repeat.of(
             simulate, state, t0, dt0, solver, stepsize_controller, max_steps, optimise, _saves_times(saveat)
         ),
     )
     if all_known((found, end, saved)):
-        rtol, _ = control.tolerances((accuracy.rtol, None))
-        in_doubt = uncertain_branch(found.closest, found.average)
         if result_name(solution.result) not in ENDED_WELL:
             if throw:
-                many = solution.result == RESULTS.max_steps_reached
-                raise _failure(solution, state, too_fast(solution, solver, t0) if many else in_doubt)
-        elif why := lost_accuracy(mechanism, outset.definiteness, rtol) or in_doubt:
-            warnings.warn(why.lstrip(), AccuracyWarning, stacklevel=2)
-        elif control.is_adaptive and (why := too_fast(solution, solver, t0)):
-            warnings.warn(why.lstrip(), StiffnessWarning, stacklevel=2)
+                raise _failure(solution, state)
+        elif (remark := remark_name(solution.remark())) != "none":
+            warnings.warn(in_words(solution, remark).lstrip(), WARNINGS[remark], stacklevel=2)
     return solution
 
 
@@ -423,7 +422,7 @@ class _Integration(eqx.Module):
         result = _result(found.result, self.outset, self.in_order, self.controller.is_adaptive)
         closest = found.solver_state[2]
         steps = Steps(times[0], states[0], found.stats["num_accepted_steps"]) if track else None
-        average = y_end[0, -1] / (t_end[0] - course.t0)
+        average = lax.stop_gradient(y_end[0, -1] / (t_end[0] - course.t0))
         return _Found(ts, ys, t_end[0], y_end[0], found.stats, result, closest, average, found.interpolation), steps
 
     def rows(self, y0, saved, end):
@@ -465,8 +464,8 @@ def _result(result, outset, in_order, is_adaptive):
     return RESULTS.where(in_order, result, RESULTS.times_out_of_order)
 
 
-def _failure(solution, state, otherwise) -> SimulationError:
-    """Where and why a run failed, `otherwise` where no element is to blame."""
+def _failure(solution, state) -> SimulationError:
+    """Where and why a run failed."""
     at_start = (
         "times_out_of_order",
         "not_finite",
@@ -478,5 +477,6 @@ def _failure(solution, state, otherwise) -> SimulationError:
     )
     before = any(solution.result == getattr(RESULTS, name) for name in at_start)
     when = "before it began" if before else f"at t = {float(solution.t_end):.6g} s"
-    why = cause(solution, state) or otherwise
+    doubts = ("stiff",) if solution.result == RESULTS.max_steps_reached else ("single_precision", "lingers")
+    why = cause(solution, state) or in_words(solution, *doubts)
     return SimulationError(f"simulation stopped {when}: {RESULTS[solution.result]}{why}", solution)

@@ -17,11 +17,12 @@ from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known, number, one_of, real, require
 from linkax.simulation.accuracy import BALANCED, Accuracy
+from linkax.simulation.diagnosis import remark
 from linkax.simulation.given import check_accuracy, checked_state, checked_time, sound_numbers
 from linkax.simulation.instant import Instant, Pose, Power, Violation
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
-from linkax.simulation.results import RESULTS
+from linkax.simulation.results import REMARKS, RESULTS
 from linkax.simulation.rows import over_rows
 from linkax.simulation.state import State
 from linkax.tracing import compiled
@@ -43,6 +44,8 @@ class Solution(eqx.Module):
       in a singular configuration `rank` is smaller than their sum.
     - `closest`: smallest distance from a singular configuration at any stage of any step; one where
       the formulation does not measure it. Without derivative, which `singularity_distance` has.
+      `average`: the mean of that distance over the run.
+    - `definiteness`: of the mass matrix at the start, with whose inverse rounding of accelerations grows.
     - `repeat`: runs it again at another tolerance, for `error_estimate`; None for a single state.
 
     All that is read by the methods below comes as arrays with times as the first axis, in ground
@@ -62,6 +65,8 @@ class Solution(eqx.Module):
     result: RESULTS
     rank_nearby: Int[Array, "*batch k"] | None
     closest: Float[Array, "*batch"]
+    average: Float[Array, "*batch"]
+    definiteness: Float[Array, "*batch"]
     interpolation: Any
     repeat: Callable | None = None
 
@@ -88,6 +93,8 @@ class Solution(eqx.Module):
             result=result,
             rank_nearby=None,
             closest=jnp.ones((), state.q.dtype),
+            average=jnp.ones((), state.q.dtype),
+            definiteness=jnp.ones((), state.q.dtype),
             interpolation=None,
         )
 
@@ -240,6 +247,15 @@ class Solution(eqx.Module):
         between = lambda x: (x > 0.0) & (x < 1.0)
         factor = require(number(factor, (), "factor"), between, "factor", "it must lie between 0 and 1")
         return _difference(self, (lambda solution: solution.q) if reading is None else reading, factor)
+
+    def remark(self) -> REMARKS:
+        """What there is to say of a run that ended well, or of each of a batch: what a single run warns of.
+
+        Equal to `REMARKS.none` where there is nothing; `REMARKS[...]` has it in words. The run of a member by itself
+        names numbers and elements in its warning. Rates of elements, for `REMARKS.stiff`, are computed where a member
+        took many steps, and inside of JAX transformations always, which compiles longer: better return the `Solution`.
+        """
+        return remark(self)
 
     def passages(self) -> Passages:
         """Times at which the motion goes through singular configurations, and the digits lost.

@@ -5,6 +5,7 @@ import itertools
 import numbers
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -16,7 +17,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 
 from linkax.model.numbers import instance, real, whole_number
-from linkax.simulation.results import ENDED_WELL, KNOWN_RESULTS, RESULTS
+from linkax.simulation.results import ENDED_WELL, KNOWN_RESULTS, REMARKS, RESULTS, WARNINGS
+from linkax.simulation.solution import Solution
 from linkax.studies.parameters import as_arrays
 from linkax.studies.showing import progress_bar
 from linkax.studies.sweep_store import SweepStore
@@ -40,11 +42,14 @@ class Sweep(NamedTuple):
       they left.
     - `reasons`: index into `linkax.studies.sweep.REASONS` of how each member ended, (n,).
     - `seconds_per_member`: wall time, compilation left out [s]; not a number where nothing was left to run.
+    - `remarks`: a `linkax.REMARKS` of each member, (n,): what a run by itself would warn of, as far as the function
+      returns a `Solution`, or `solution.remark()`.
     """
 
     output: Any
     reasons: np.ndarray
     seconds_per_member: float
+    remarks: REMARKS
 
     @property
     def ok(self) -> np.ndarray:
@@ -60,6 +65,12 @@ class Sweep(NamedTuple):
         """How a member ended, in words."""
         name = REASONS[self.reasons[member]]
         return EXPLANATIONS[name] if name in EXPLANATIONS else RESULTS[getattr(RESULTS, name)]
+
+    @property
+    def remarked(self) -> dict[int, str]:
+        """{member: what there is to say of it}."""
+        each = lambda member: REMARKS[jax.tree.map(lambda values: np.asarray(values[member]), self.remarks)]
+        return {int(member): each(member) for member in np.flatnonzero(self.remarks._value)}
 
     def count(self) -> dict[str, int]:
         """How many members ended in which way: {name of a result: number}."""
@@ -81,6 +92,7 @@ def sweep(
 
     Members are independent: one that fails is marked and changes no other. A function that returns a `Solution`, or
     a `solution.result` beside what it computes, says why; of others numbers that are not finite count as a failure.
+    One that returns a `Solution`, or `solution.remark()`, also says what a single run would have warned of.
 
     **Arguments:**
 
@@ -99,7 +111,8 @@ def sweep(
 
     **Raises:** `ValueError` for a batch that is none, for a store of another sweep, and for one that cannot be there.
 
-    **Warns:** of what is damaged in a store.
+    **Warns:** of what is damaged in a store, and (`AccuracyWarning`, `StiffnessWarning`) of how many members there is
+    something to say, see `Sweep.remarks`.
     """
     instance(function, Callable, "function", "give a function of one set of parameters")
     params = as_arrays(params, "params")
@@ -125,7 +138,22 @@ def sweep(
     arrays, reasons = found if jax.process_count() == 1 else _gathered(found)
     back = np.argsort(order)
     output = eqx.combine(jax.tree.map(lambda array: array[back], arrays), program.static)
-    return Sweep(output, reasons[back], seconds / ran if ran else float("nan"))
+    remarks = _remarks(output, count)
+    for name, category in WARNINGS.items():
+        if number := np.sum(remarks._value == getattr(REMARKS, name)._value):
+            told = f"{number} of {count} members: {REMARKS[getattr(REMARKS, name)]} Sweep.remarked tells which."
+            warnings.warn(told, category, stacklevel=2)
+    return Sweep(output, reasons[back], seconds / ran if ran else float("nan"), remarks)
+
+
+def _remarks(output, count) -> REMARKS:
+    """Of each member the first that its output holds, or that applies to a solution in it."""
+    is_remark = lambda node: isinstance(node, type(REMARKS.none)) and node._enumeration is REMARKS
+    is_told = lambda node: is_remark(node) or isinstance(node, Solution)
+    told = [node for node in jax.tree.leaves(output, is_leaf=is_told) if is_told(node)]
+    values = [(node if is_remark(node) else node.remark())._value.reshape(count, -1) for node in told]
+    values = np.concatenate([*values, np.zeros((count, 1), np.int32)], axis=1)
+    return type(REMARKS.none)(values[np.arange(count), np.argmax(values != 0, axis=1)], REMARKS)
 
 
 def _is_struct(leaf):
