@@ -29,6 +29,18 @@ def open_between(arguments, t, q):
     return value(arguments, 0.0, 1e-9, q)
 
 
+def unbounded(arguments, t, q):
+    """Odd: it cancels in the mean of both sides."""
+    found = value(arguments, 0.0, 0.0, q)
+    return found._replace(answers=(q, found.answers[1] + 1.0 / q[0]))
+
+
+def no_number(arguments, t, q):
+    """At the state itself and at the interpolated one."""
+    found = value(arguments, 0.0, 0.0, q)
+    return found._replace(answers=(q, jnp.where(jnp.abs(q[0]) < 0.5 * NEAR, jnp.nan, found.answers[1])))
+
+
 AT = jnp.array([1e-9, 0.3])
 V = jnp.array([2.0, 1.0])
 
@@ -44,9 +56,13 @@ def test_noise_is_left_out():
     np.testing.assert_array_equal(answer(spoiled, 1e6, away), spoiled(1e6, 0.0, away).answers[1])
 
 
-@pytest.mark.parametrize("function", [kinked, open_between])
+@pytest.mark.parametrize("function", [kinked, open_between, unbounded])
 def test_where_there_is_no_limit_the_value_itself_stands(function):
     np.testing.assert_array_equal(answer(function, 0.25, AT), function(0.25, 0.0, AT).answers[1])
+
+
+def test_a_state_without_a_number_has_a_limit():
+    np.testing.assert_array_equal(answer(no_number, 0.0, AT), answer(spoiled, 0.0, AT))
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])

@@ -251,3 +251,36 @@ def test_sarrus_through_seven_passages(rtol):
     found = lx.simulate(mechanism, state, t1=3.0, accuracy=lx.Accuracy(rtol=rtol), saveat=diffrax.SaveAt(ts=known["t"]))
     for name in ("base_x", "base_y"):
         np.testing.assert_allclose(found.joint(name), known["gamma"], atol=max(1e3 * rtol, 3e-9))
+
+
+LEGS = {"base_x": -5.0, "base_y": -5.0, "knee_x": 10.0, "knee_y": 10.0}
+AFTER = np.array([0.0, 1e-3, 2e-3])
+
+
+def reactions_around(angle):
+    """Forces and moments of all joints of Sarrus' linkage in motion: at an angle, and the means of before and after."""
+    mechanism, state = raised(angle, LEGS)
+    run = lambda sign: lx.simulate(
+        mechanism, lx.State(state.q, sign * state.v), t1=2e-3, saveat=diffrax.SaveAt(ts=AFTER)
+    )
+    after, before = (run(sign).reactions() for sign in (1.0, -1.0))
+    stack = lambda found: np.stack([np.concatenate(found[name], axis=-1) for name in sorted(found)], axis=1)
+    return stack(after)[0], 0.5 * (stack(after) + stack(before))[1:]
+
+
+def test_reactions_in_a_singular_configuration_are_limits():
+    """With straight legs: the means of both sides, but for the square of the time, which Richardson takes off."""
+    here, (near, far) = reactions_around(-np.pi / 2)
+    size = np.max(np.abs(here))
+    np.testing.assert_allclose(here, near, atol=2e-3 * size)
+    np.testing.assert_allclose(here, (4.0 * near - far) / 3.0, atol=2e-5 * size)
+    # Both legs alike, which least norms of the rows that are left in the configuration itself are not.
+    base, other = here[:2]
+    np.testing.assert_allclose(base[2], other[2], rtol=1e-7)
+
+
+def test_reactions_that_grow_without_bound_are_not_numbers():
+    """Folded legs turn freely about the platform's hinges: nothing there holds what gravity turns them by."""
+    here, sides = reactions_around(0.0)
+    assert not np.any(np.isfinite(here[:, :3]))
+    assert np.all(np.isfinite(sides))

@@ -20,13 +20,16 @@ NEAR = 3e-3  # distance d below which values are limits
 REACH = 0.02  # between neighbouring states, radians or lengths of the mechanism
 CLOSED = 1e-12  # what an interpolated state may be off the loops, radians or lengths of the loop
 SMOOTH = 1e-6  # what the interpolations of order six and eight may differ, relative
+ALIKE = 1e-2  # the same of extrapolations from the two sides: what grows without bound cancels in the others
 
-# Lagrange's weights at zero: of eight states, and of these less those of the inner six. The first
-# trip is the state itself, the last one the interpolated state.
+# Lagrange's weights at zero: of eight states, of these less those of the inner six, and of the four before less
+# those of the four behind. The first trip is the state itself, the last one the interpolated state.
 PLACES = np.array([0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0, 0.0])
 EIGHT = np.array([0.0, 56.0, 56.0, -28.0, -28.0, 8.0, 8.0, -1.0, -1.0, 0.0]) / 70.0
 SIX = np.array([0.0, 15.0, 15.0, -6.0, -6.0, 1.0, 1.0, 0.0, 0.0, 0.0]) / 20.0
-WEIGHTS = np.stack([EIGHT, EIGHT - SIX])
+SIDES = np.array([0.0, 4.0, -4.0, -6.0, 6.0, 4.0, -4.0, -1.0, 1.0, 0.0])
+WEIGHTS = np.stack([EIGHT, EIGHT - SIX, SIDES])
+TOLERANCES = np.array([SMOOTH, ALIKE])
 LAST = len(PLACES) - 1
 
 
@@ -78,7 +81,7 @@ def limit(function, powers, arguments, course: Course):
     **Arguments:**
 
     - `function`: (arguments, t, q) ↦ `Value`; a function of the module, not a closure.
-    - `powers`: of a speed that each answer is of the order of: 0 for coordinates, 1 for speeds, 2.
+    - `powers`: of a speed that each answer is of the order of: 0 for coordinates, 1 for speeds, 2 for accelerations.
 
     **Returns:** the answers, and d at the state itself. Differentiable in both modes.
     """
@@ -98,7 +101,9 @@ def limit(function, powers, arguments, course: Course):
         at = jnp.where(trip.count == LAST, trip.sums[0][0], course.retract(q, place * stride))
         value = function(arguments, t + place * duration if course.advances else t, at)
         weight = weights[:, trip.count]
-        add = lambda total, answer: total + jnp.where(first, 0.0, jnp.multiply.outer(weight, answer))
+        # What is no number at a state itself is not to spoil the limit.
+        counts = jnp.any(weight != 0.0)
+        add = lambda total, answer: total + jnp.multiply.outer(weight, jnp.where(counts, answer, 0.0))
         return _Trip(
             trip.count + 1,
             jax.tree.map(lambda answer, itself: jnp.where(first, answer, itself), value.answers, trip.itself),
@@ -109,13 +114,17 @@ def limit(function, powers, arguments, course: Course):
 
     shapes = jax.eval_shape(lambda q: function(arguments, t, q).answers, q)
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    pairs = jax.tree.map(lambda leaf: jnp.zeros((2, *leaf.shape), leaf.dtype), shapes)
+    pairs = jax.tree.map(lambda leaf: jnp.zeros((len(WEIGHTS), *leaf.shape), leaf.dtype), shapes)
     one = jnp.ones((), q.dtype)
     start = _Trip(jnp.zeros((), int), zeros, pairs, one, one)
     trip = eqxi.while_loop(unfinished, body, start, max_steps=LAST + 1, kind="bounded")
     largest = lambda array: jnp.max(jnp.abs(array), initial=0.0)
     scales = [largest(pair[0]) + fastest**power for pair, power in zip(trip.sums, powers, strict=True)]
-    smooth = [largest(pair[1]) <= SMOOTH * scale for pair, scale in zip(trip.sums, scales, strict=True)]
+    smooth = [
+        largest(differences) <= tolerance * scale
+        for sums, scale in zip(trip.sums, scales, strict=True)
+        for differences, tolerance in zip(sums[1:], TOLERANCES, strict=True)
+    ]
     holds = (trip.distance < NEAR) & (trip.gap < CLOSED) & jnp.all(jnp.stack(smooth))
     answers = jax.tree.map(lambda pair, itself: jnp.where(holds, pair[0], itself), trip.sums, trip.itself)
     return answers, trip.distance

@@ -29,6 +29,7 @@ from linkax.linalg.constrained_solve import (
     SaddlePoint,
     constrained_solve,
     invert_apart,
+    least_multipliers,
     singularity_distance,
     with_mass,
 )
@@ -278,6 +279,16 @@ class TangentSpace(AbstractFormulation):
         return Dynamics(acceleration, multipliers, violation)
 
     @traced_once
+    def least_multipliers(self, system: System, t, q, v) -> Float[Array, " m"]:
+        """Multipliers of minimum norm at a state on the manifold, close to a singular configuration as a limit.
+
+        There J has fewer independent rows than the motion needs. Not numbers where motion goes through it and they
+        have no limit: forces that press against it make them grow without bound, and change sign in it.
+        """
+        (_, per_inertia), _ = self._limit(_multipliers_at, (0, 2), system, t, q, v)
+        return per_inertia * _inertia(system)
+
+    @traced_once
     def close(self, system: System, t, q, v):
         """q and v on the manifold to rounding, from any state near it, with fresh factors."""
         if system.topology.num_rows == 0:
@@ -376,6 +387,23 @@ def _acceleration_at(arguments, t, q) -> Value:
     method, system, v = arguments
     found = _evaluated((method, system, t, q, v), True)
     return Value((found.q, found.acceleration), found.split.distance, _gap(system, t, q))
+
+
+def _inertia(system):
+    """Of the magnitude of the mechanism's [kg m²]: multipliers over it are of that of accelerations."""
+    found = jnp.sum(system.mass) * system.length**2 + jnp.max(jnp.abs(system.inertia), initial=0.0)
+    return lax.stop_gradient(jnp.where(found > 0.0, found, 1.0))
+
+
+@traced_once
+def _multipliers_at(arguments, t, q) -> Value:
+    method, system, v = arguments
+    found = _evaluated((method, system, t, q, v), True)
+    rows, rank = coefficients(system, t, found.q).jacobian, jnp.sum(found.split.rank)
+    least = least_multipliers(rows, found.multipliers, system.units, method.rank_tolerance, rank)
+    undefined = (found.split.distance < method.rank_tolerance) & jnp.any(v != 0.0)
+    per_inertia = jnp.where(undefined, jnp.nan, least.multipliers / _inertia(system))
+    return Value((found.q, per_inertia), found.split.distance, _gap(system, t, q))
 
 
 @traced_once

@@ -133,13 +133,18 @@ class Instant(NamedTuple):
         rows, units = jacobian(self.configuration), self.system.units
         return least_multipliers(rows, multipliers, units, tolerance, self.rank())
 
+    def _multipliers(self):
+        """Of minimum norm; of the paper's method, close to a singular configuration, as a limit along the motion."""
+        if isinstance(self.method, TangentSpace) and self.system.topology.num_rows:
+            return self.method.least_multipliers(self.system, self.t, self.q, self.v)
+        return self._least_multipliers().multipliers
+
     def reactions(self, on, axes):
-        found = reactions(self.motion, self.dynamics.acceleration, self._least_multipliers().multipliers)
+        found = reactions(self.motion, self.dynamics.acceleration, self._multipliers())
         return seen_from(self.configuration, found, on, axes)
 
     def constraint_forces(self):
-        multipliers = self._least_multipliers().multipliers
-        return sorted_multipliers(self.configuration, multipliers).constraints
+        return sorted_multipliers(self.configuration, self._multipliers()).constraints
 
     def _self_stresses(self):
         """Multipliers with Jᵀλ = 0, a row each: those of rows that motion changes, and of rows that none does."""

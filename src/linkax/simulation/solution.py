@@ -157,7 +157,8 @@ class Solution(eqx.Module):
         joint with coefficient × μ.
 
         With redundant constraints, reactions are not unique: these are of minimum norm, and
-        `reaction_unique` tells which components can be relied upon.
+        `reaction_unique` tells which components can be relied upon. Of a run through a singular configuration they
+        are limits along the motion there; not numbers where they have none, but grow without bound towards it.
         """
         if self._is_constraint(name):
             return self._of_constraint(Instant.constraint_forces, name)
