@@ -4,6 +4,7 @@ import abc
 from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -46,6 +47,9 @@ class AbstractForce(AbstractElement):
     `motion` is a `linkax.Motion`: where all bodies are and how they move at one instant, and how
     loads on points and along joints are made. `motion.system` has the mechanism's numbers in the
     order of its bodies. Numbers that are fields are traced.
+
+    One whose load has a kink or a jump has a `switch` too, which is zero there, and its load is told the side:
+    `load(t, motion, on)`. Steps then end there, and derivatives are right across it.
     """
 
     @property
@@ -59,12 +63,36 @@ class AbstractForce(AbstractElement):
 
     @abc.abstractmethod
     def load(self, t, motion) -> Load:
-        """What the element applies at time t [s]."""
+        """What the element applies at time t [s].
 
-    def applied(self, t, motion) -> Load:
-        """The load, checked for what a user's own class may do wrong."""
+        Where it has a `switch`, a third argument `on` says whether that is positive. A step that adapts keeps it as it
+        is where the step begins, so that the load goes on smoothly a little past zero.
+        """
+
+    def switch(self, t, motion) -> Float[Array, ""]:
+        """A number whose sign changes where the load has a kink or jumps; of magnitude one, like a strain.
+
+        The motion must go through zero there, and not be pushed back from both sides. None where there is none.
+        """
+        return None
+
+    def switched(self, t, motion) -> Float[Array, ""]:
+        """The switch, checked for what a user's own class may do wrong."""
         try:
-            found = self.load(t, motion)
+            found = self.switch(t, motion)
+        except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+            raise ValueError(f"{self.described}: its switch raises {raised(error)}") from error
+        if not isinstance(found, jax.Array) or found.shape != () or not jnp.issubdtype(found.dtype, jnp.floating):
+            raise ValueError(f"{self.described}: its switch is {found!r}; give one number that depends on the motion")
+        return found
+
+    def applied(self, t, motion, on=None) -> Load:
+        """The load, checked for what a user's own class may do wrong; `on`: see `load`, by default as it is."""
+        side = ()
+        if has_switch(self):
+            side = (self.switched(t, motion) > 0.0 if on is None else on,)
+        try:
+            found = self.load(t, motion, *side)
         except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
             raise ValueError(f"{self.described}: its load raises {raised(error)}") from error
         whole = Load.none(motion.system)
@@ -82,6 +110,11 @@ class AbstractForce(AbstractElement):
     def potential_energy(self, configuration):
         """Potential energy [J]; zero for an element that has none."""
         return jnp.zeros((), configuration.system.dtype)
+
+
+def has_switch(force: AbstractForce) -> bool:
+    """Whether the load of a force element has a kink or jumps, see `AbstractForce.switch`."""
+    return type(force).switch is not AbstractForce.switch
 
 
 def _described(kind, of):

@@ -142,13 +142,20 @@ class ElasticRope(AbstractForce):
     def _stretch(self, configuration):
         return jnp.sum(length(_spans(configuration, self.points))) - self.free_length
 
-    def load(self, t, motion):
-        configuration = motion.configuration
-        stretch = self._stretch(configuration)
-        along = _directions(_spans(configuration, self.points))
-        rate = jnp.sum(dot(along, _rate(motion, self.points)))
-        tension = jnp.maximum(self.stiffness * stretch + self.damping * rate, 0.0)
-        return _pull(configuration, self.points, jnp.where(stretch > 0.0, tension, 0.0))
+    def _rate_of_stretch(self, motion):
+        along = _directions(_spans(motion.configuration, self.points))
+        return jnp.sum(dot(along, _rate(motion, self.points)))
+
+    def switch(self, t, motion):
+        """Positive where it is taut: longer than free, and not shortening so fast that damping takes all its pull."""
+        stretch = self._stretch(motion.configuration)
+        slower = self.damping / self.stiffness * self._rate_of_stretch(motion)
+        return (stretch + jnp.minimum(slower, 0.0)) / self.free_length
+
+    def load(self, t, motion, on):
+        stretch, rate = self._stretch(motion.configuration), self._rate_of_stretch(motion)
+        tension = self.stiffness * stretch + self.damping * rate
+        return _pull(motion.configuration, self.points, jnp.where(on, tension, 0.0))
 
     def potential_energy(self, configuration):
         return self.stiffness * jnp.maximum(self._stretch(configuration), 0.0) ** 2 / 2.0

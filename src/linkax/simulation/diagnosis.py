@@ -82,7 +82,7 @@ def _forces(solution, system, t, state):
     """Force elements whose load is not finite."""
     motion = move(configure(system, jnp.asarray(t), state.q), state.v)
     for force in solution.mechanism.forces:
-        load = force.load(jnp.asarray(t), motion)
+        load = force.applied(jnp.asarray(t), motion)
         if not all(bool(jnp.all(jnp.isfinite(part))) for part in load):
             return f" The load of {force.described} is not finite at t = {float(t):.6g} s."
     return ""
@@ -334,7 +334,7 @@ def _elements(mechanism, accuracy, t, state):
 
     def forces(change, faster):
         motion = move(configure(system, t, retract(system.topology, state.q, basis @ change)), state.v + basis @ faster)
-        loads = [force.load(t, motion) for force in mechanism.forces]
+        loads = [force.applied(t, motion) for force in mechanism.forces]
         along = lambda load: load.joint_force + along_speeds(motion.configuration, load.force, load.moment)
         return jnp.stack([along(load) @ basis for load in loads])
 

@@ -25,6 +25,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import Accuracy
 from linkax.simulation.state import State
+from linkax.simulation.switches import crossed, held, meet, values
 from linkax.tracing import in_one_kernel
 
 NOISE_ULPS = 1.0
@@ -45,9 +46,10 @@ class Problem(eqx.Module):
     """The right-hand side's arguments: a mechanism, its numbers, the method that solves it, how well.
 
     diffrax integrates one vector: q, v, and the time integral of the distance d from the nearest
-    singular configuration, whose rates tell a step how close its stages came. From a state that
-    is not `sound`, no step is taken. At `closed_at` [s] the state is on the loops already: there a correction would
-    be rounding alone, which close to a singular configuration is amplified. `from_singular`: the run starts in one.
+    singular configuration, whose rates tell a step how close its stages came. Where steps adapt to switches of force
+    elements, the sides of these come first. From a state that is not `sound`, no step is taken. At `closed_at` [s] the
+    state is on the loops already: there a correction would be rounding alone, which close to a singular configuration
+    is amplified. `from_singular`: the run starts in one.
     """
 
     mechanism: Mechanism
@@ -58,13 +60,31 @@ class Problem(eqx.Module):
     closed_at: Float[Array, ""] = np.inf
     from_singular: Bool[Array, ""] = False
 
-    def packed(self, q, v, integral=0.0):
+    def packed(self, q, v, integral=0.0, sides=()):
         """The vector that diffrax integrates."""
-        return jnp.concatenate([q, v, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
+        return jnp.concatenate([jnp.asarray(sides, q.dtype), q, v, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
+
+    def _first(self, y):
+        """Where q begins in such vectors: after the sides."""
+        return y.shape[-1] - self.system.topology.num_coordinates - self.system.topology.num_speeds - 1
 
     def unpacked(self, y):
-        """q and v of such vectors, (..., n_q + n_v + 1)."""
-        return y[..., : self.system.topology.num_coordinates], y[..., self.system.topology.num_coordinates : -1]
+        """q and v of such vectors, (..., m + n_q + n_v + 1)."""
+        first = self._first(y)
+        middle = first + self.system.topology.num_coordinates
+        return y[..., first:middle], y[..., middle:-1]
+
+    def sides(self, y):
+        """The sides of switches on which force elements are held, (m,); none where steps do not adapt to them."""
+        return y[: self._first(y)]
+
+    def on_sides(self, y, sides):
+        """The same vector with other sides."""
+        return jnp.concatenate([sides, y[len(sides) :]])
+
+    def switches(self, t, y):
+        """Values of the switches at a vector, (m,)."""
+        return values(self.system, t, *self.unpacked(y))
 
     def errors(self, y, error):
         """Error estimates of q and v at a vector y, as changes (n_v,) of both."""
@@ -76,8 +96,10 @@ class Problem(eqx.Module):
         correct = self.accuracy.projection in ("both", "stage") and t != self.closed_at
 
         def packed_rates(y):
-            v, acceleration, q, distance = self.method.derivative(self.system, t, *self.unpacked(y), correct)
-            return self.packed(rates(self.system.topology, q, v), acceleration, distance)
+            sides = self.sides(y)
+            system = held(self.system, sides) if len(sides) else self.system
+            v, acceleration, q, distance = self.method.derivative(system, t, *self.unpacked(y), correct)
+            return self.packed(rates(system.topology, q, v), acceleration, distance, jnp.zeros_like(sides))
 
         return _apart(packed_rates, y, jnp.full_like(y, jnp.nan))
 
@@ -103,12 +125,15 @@ class StepError(NamedTuple):
     - `leaves`: distance d from the nearest singular configuration where the step begins.
     - `passes`: the smallest d of its other stages. `retry`: by how much to change the step so that
       what passes there falls between two stages.
+    - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
+      past, one for none; None where there are none.
     """
 
     error: Any
     leaves: Float[Array, ""]
     passes: Float[Array, ""]
     retry: Float[Array, ""]
+    switch: Float[Array, ""] | None = None
 
 
 def placements(nodes) -> np.ndarray:
@@ -242,7 +267,8 @@ class Projected(diffrax.AbstractAdaptiveSolver):
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         inner, leaves, closest = solver_state
         # Solvers that begin with the last derivative of the step before must not where the state has moved since.
-        made_jump = True if self.after_step and args.method.moves_after_steps else made_jump
+        switching = len(args.sides(y0)) > 0
+        made_jump = True if switching or (self.after_step and args.method.moves_after_steps) else made_jump
         solver = self._stepping(args, y0, t1 - t0)
         y1, error, dense_info, inner, result = solver.step(terms, t0, t1, y0, args, inner, made_jump)
         stages = self._stages(dense_info, t1 - t0)
@@ -258,11 +284,16 @@ class Projected(diffrax.AbstractAdaptiveSolver):
             leaves_now, passes = stages[0], stages[1:][nearest]
             retry = jnp.asarray(placements(self.solver.tableau.c), passes.dtype)[nearest]
         closest = jnp.minimum(closest, jnp.minimum(passes, arrives))
-        return y1, StepError(error, leaves_now, passes, retry), dense_info, (inner, arrives, closest), result
+        switch = None
+        if switching:
+            within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
+            switch, sides = lax.stop_gradient(meet(*lax.stop_gradient((args, t0, t1, y0, y1)), within))
+            y1 = args.on_sides(y1, sides) if self.is_final else crossed(args, t1, y1, sides)
+        return y1, StepError(error, leaves_now, passes, retry, switch), dense_info, (inner, arrives, closest), result
 
-    def corrected(self, problem: Problem, t1, y1):
-        """The state that a step leaves."""
-        return _corrected(problem, t1, y1, None)[0] if self.after_step else y1
+    def corrected(self, problem: Problem, t1, y1, sides):
+        """The state that a step leaves, on these sides of switches."""
+        return crossed(problem, t1, _corrected(problem, t1, y1, None)[0] if self.after_step else y1, sides)
 
     def _stages(self, dense_info, duration):
         """Distances at the stages of a Runge-Kutta step, where this is one."""
@@ -277,7 +308,7 @@ def _corrected(problem, t1, y1, error):
 
     def correct(y):
         q, v, errors_left, distance = problem.method.correct(problem.system, t1, *problem.unpacked(y), errors)
-        return problem.packed(q, v, y[-1]), errors_left, distance
+        return problem.packed(q, v, y[-1], problem.sides(y)), errors_left, distance
 
     undefined = jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), (y1, errors))
     y1, errors, distance = _apart(correct, y1, (*undefined, jnp.ones((), y1.dtype)))
@@ -295,7 +326,8 @@ class MechanismControl(diffrax.AbstractStepSizeController):
 
     An adaptive step that has a stage close to a singular configuration is tried again, shorter,
     so that the configuration falls between two stages. Where a few tries do not help, or the step
-    begins in the singular configuration, it is left as it is.
+    begins in the singular configuration, it is left as it is. One that goes past a switch of a force element is tried
+    again up to there, see `linkax.simulation.switches`.
 
     `is_final`: see `Projected`.
     """
@@ -372,11 +404,17 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             return keep & finite, jnp.where(finite, next_t0, t0), next_t1, jump, (after, retries), result
         near = jnp.minimum(args.accuracy.clearance, FEASIBLE * y_error.leaves)
         again = keep & (y_error.passes < near) & (retries < MOST_RETRIES)
+        end = t0 + y_error.retry * (t1 - t0)
+        if y_error.switch is not None:
+            late = y_error.switch < 1.0
+            to_switch = t0 + y_error.switch * (t1 - t0)
+            end = jnp.where(late, jnp.where(keep, to_switch, jnp.minimum(to_switch, next_t1)), end)
+            again = again | late
         either = lambda retry, otherwise: jax.tree.map(lambda a, b: jnp.where(again, a, b), retry, otherwise)
         return (
             keep & jnp.logical_not(again),
             either(t0, next_t0),
-            either(t0 + y_error.retry * (t1 - t0), next_t1),
+            either(end, next_t1),
             jump & jnp.logical_not(again),
             (either(before, after), jnp.where(again, retries + 1, jnp.where(keep, 0, retries))),
             result,

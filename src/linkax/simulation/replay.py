@@ -106,10 +106,10 @@ def _uncorrected(solver, problem, t0, t1, y0):
     return dict(y0=y0, y1=y0 + jnp.asarray(_Tableau.of(solver.solver).result, y0.dtype) @ k, k=k)
 
 
-def _step(solver: Projected, problem: Problem, t0, t1, y0):
-    """The state that a step and the correction after it leave, and what interpolates in it."""
+def _step(solver: Projected, problem: Problem, t0, t1, y0, sides):
+    """The state that a step and the correction after it leave, on the sides after it, and what interpolates in it."""
     dense = _uncorrected(solver, problem, t0, t1, y0)
-    return solver.corrected(problem, t1, dense["y1"]), dense
+    return solver.corrected(problem, t1, dense["y1"], sides), dense
 
 
 def _pulled(function, primals, cotangent):
@@ -119,16 +119,16 @@ def _pulled(function, primals, cotangent):
     return lax.cond(jnp.all(jnp.isfinite(cotangent)), pull, lambda cotangent: otherwise, cotangent)
 
 
-def _step_backwards(solver: Projected, of_problem, problem, t0, t1, dense, y1_bar, dense_bar):
+def _step_backwards(solver: Projected, of_problem, problem, t0, t1, dense, sides, y1_bar, dense_bar):
     """Cotangents of a problem, both times and the state before a step, of the state after it and what interpolates.
 
-    `of_problem`: what a problem is of that of it which is differentiated.
+    `of_problem`: what a problem is of that of it which is differentiated. `sides`: see `_step`.
     """
     table, duration = _Tableau.of(solver.solver), t1 - t0
     y0, k = dense["y0"], dense["k"]
     weights, nodes = jnp.asarray(table.weights, y0.dtype), jnp.asarray(table.nodes, y0.dtype)
     result = jnp.asarray(table.result, y0.dtype)
-    corrected = lambda problem, t, y: solver.corrected(of_problem(problem), t, y)
+    corrected = lambda problem, t, y: solver.corrected(of_problem(problem), t, y, sides)
     rates = lambda problem, t, y: of_problem(problem).derivative(t, y)
     problem_bar, t1_bar, y_bar = _pulled(corrected, (problem, t1, dense["y1"]), y1_bar)
     y_bar = y_bar + dense_bar["y1"]
@@ -163,8 +163,8 @@ def _forwards(solver, every, course, steps, restored, flat) -> Motion:
     saved, y0, last = course.saved, course.y0, steps.count - 1
     saved_dot = None if saved is None else materialised(saved, changes.saved)
 
-    def step(problem, t0, t1, y):
-        return _step(solver, problem, t0, t1, y)
+    def step(sides, problem, t0, t1, y):
+        return _step(solver, problem, t0, t1, y, sides)
 
     def one(carry):
         k, j, y, motion = carry
@@ -172,7 +172,10 @@ def _forwards(solver, every, course, steps, restored, flat) -> Motion:
         begin_dot = jnp.where(k == 0, materialised(course.t0, changes.t0), 0.0)
         end_dot = jnp.where(k == last, materialised(course.t1, changes.t1), 0.0)
         moved = changes.problem, begin_dot, end_dot, motion.end
-        (y, dense), (y_dot, dense_dot) = eqx.filter_jvp(step, (course.problem, *ends, y), moved)
+        sides = course.problem.sides(steps.ys[k + 1])
+        (y, dense), (y_dot, dense_dot) = eqx.filter_jvp(
+            functools.partial(step, sides), (course.problem, *ends, y), moved
+        )
 
         def save(carry):
             j, found = carry
@@ -227,7 +230,10 @@ def _backwards(solver, course, steps, wanted, cotangent: Motion) -> Course:
 
             begin = j, begin_bar, end_bar, dense_bar, saved_bar
             j, begin_bar, end_bar, dense_bar, saved_bar = lax.while_loop(inside, save, begin)
-        more, begin_more, end_more, y_bar = _step_backwards(solver, of_problem, problem, *ends, dense, y_bar, dense_bar)
+        sides = course.problem.sides(steps.ys[k + 1])
+        more, begin_more, end_more, y_bar = _step_backwards(
+            solver, of_problem, problem, *ends, dense, sides, y_bar, dense_bar
+        )
         problem_bar = jax.tree.map(jnp.add, problem_bar, more)
         t0_bar = jnp.where(k == 0, begin_bar + begin_more, t0_bar)
         t1_bar = jnp.where(k == last, end_bar + end_more, t1_bar)

@@ -44,6 +44,7 @@ from linkax.simulation.results import (
 from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
+from linkax.simulation.switches import sides_of, values
 from linkax.simulation.undefined import undefined_where
 from linkax.tracing import all_known, compiled, runs_once
 
@@ -327,7 +328,9 @@ def _integrate(
         saveat = diffrax.SaveAt(ts=jnp.linspace(t0, t1, DEFAULT_SAVES, dtype=dtype))
     if not _saves_states(saveat):
         saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))
-    y0 = problem.packed(outset.state.q, outset.state.v)
+    q, v = outset.state.q, outset.state.v
+    sides = sides_of(values(problem.system, t0, q, v)) if controller.is_adaptive else ()
+    y0 = problem.packed(q, v, sides=sides)
     event = _wrapped_event(event)
     integration = _Integration(
         outset, in_order, dt0, saveat, solver, controller, adjoint, event, progress_meter, max_steps

@@ -1,0 +1,116 @@
+"""Switches of force elements: which side of each a motion is on, and where steps are to end.
+
+Each step is computed with all force elements held on the sides on which it begins, so that nothing in it has a kink.
+A step that goes past a switch is tried again, up to there, and the next begins on the other side.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from linkax.equations.configuration import configure
+from linkax.equations.motion import move
+from linkax.model.forces import has_switch
+
+SAMPLES = 8  # of a step: between two of them a force element must not switch twice
+ON_ULPS = 256.0  # of a switch: what counts as there
+TIME_ULPS = 8.0
+SHORTEN = 1e-3  # a step that begins past a switch
+ITERATIONS = 60
+
+
+class Held(eqx.Module):
+    """A force element held on one side of its switch."""
+
+    force: eqx.Module
+    side: jax.Array
+
+    def applied(self, t, motion):
+        return self.force.applied(t, motion, self.side > 0.0)
+
+
+def held(system, sides):
+    """A system with its force elements held on the given sides of their switches, (m,), 1 or −1."""
+    sides = iter(sides)
+    forces = tuple(Held(force, next(sides)) if has_switch(force) else force for force in system.forces)
+    return dataclasses.replace(system, forces=forces)
+
+
+def values(system, t, q, v):
+    """Values of all switches of force elements, (m,)."""
+    switching = [force for force in system.forces if has_switch(force)]
+    if not switching:
+        return jnp.zeros(0, q.dtype)
+    motion = move(configure(system, t, q), v)
+    return jnp.stack([force.switched(t, motion) for force in switching])
+
+
+def sides_of(values):
+    """The sides that values of switches are on."""
+    return jnp.where(values > 0.0, 1.0, -1.0).astype(values.dtype)
+
+
+def meet(problem, t0, t1, y0, y1, within):
+    """The share of a step up to the first switch that it goes past, one for none; sides after a step that has none.
+
+    `within(t)`: what interpolates in the step.
+    """
+    sides, on = problem.sides(y0), ON_ULPS * jnp.finfo(y0.dtype).eps
+    duration = t1 - t0
+    inside = lambda share: sides * problem.switches(t0 + share * duration, within(t0 + share * duration))
+    shares = jnp.asarray(np.linspace(0.0, 1.0, SAMPLES + 1), t1.dtype)
+    left = jnp.concatenate([jax.vmap(inside)(shares[:-1]), (sides * problem.switches(t1, y1))[None]])
+    nearest = jnp.min(left, axis=1)
+    past = nearest[1:] < -on
+    first = jnp.argmax(past)
+
+    def closer(carry):
+        count, a, of_a, b, of_b, _ = carry
+        c = jnp.clip(b - of_b * (b - a) / (of_b - of_a), a, b)
+        of_c = jnp.min(inside(c))
+        # False position, which halves the value of an end that stays (the Illinois method).
+        before = of_c > 0.0
+        a, of_a, b, of_b = jax.tree.map(
+            lambda after, ahead: jnp.where(before, after, ahead), (c, of_c, b, of_b / 2.0), (a, of_a / 2.0, c, of_c)
+        )
+        count = jnp.where((jnp.abs(of_c) <= on / 4.0) | (b <= a), ITERATIONS, count + 1)
+        return count, a, of_a, b, of_b, c
+
+    begin = jnp.where(jnp.any(past), 0, ITERATIONS), shares[first], jnp.maximum(nearest[first], 0.0)
+    begin = (*begin, shares[first + 1], nearest[first + 1], shares[first + 1])
+    *_, share = lax.while_loop(lambda carry: carry[0] < ITERATIONS, closer, begin)
+    least = TIME_ULPS * jnp.finfo(t1.dtype).eps * jnp.maximum(jnp.abs(t1), duration)
+    resolved = jnp.any(past) & ((1.0 - share) * duration > least)
+    arrives = (left[-1] <= on) & (left[-1] < left[-2])
+    return jnp.where(resolved, jnp.maximum(share, SHORTEN), 1.0), jnp.where(arrives, -sides, sides)
+
+
+def crossed(problem, t, y, sides):
+    """A state on the sides of switches that it goes over to, with the derivative of when it does.
+
+    Where forces jump, a change of the time changes the motion after it: (f₋ − f₊) dt, of which dt = −dg / ġ for a
+    switch g (the saltation matrix; Leine and Nijmeijer (2004), Dynamics and Bifurcations of Non-Smooth Mechanical
+    Systems, ch. 7). Forces that have a kink alone do not jump.
+    """
+    before = problem.sides(y)
+    if not len(before):
+        return y
+    crosses = sides != before
+
+    def jumps(y):
+        each = jnp.concatenate([before[None], jnp.where(np.eye(len(before), dtype=bool), -before, before)])
+        rates = jax.vmap(lambda sides: problem.derivative(t, problem.on_sides(y, sides)))(each)
+        _, speeds = jax.jvp(problem.switches, (t, y), (jnp.ones_like(t), rates[0]))
+        moves = crosses & (speeds != 0.0)
+        jump = (rates[0] - rates[1:]) / jnp.where(moves, speeds, 1.0)[:, None]
+        return jnp.where(moves[:, None], jump, 0.0)
+
+    none = jnp.zeros((len(before), len(y)), y.dtype)
+    jump = lax.cond(jnp.any(crosses), jumps, lambda y: none, lax.stop_gradient(y))
+    value = problem.switches(t, y)
+    delay = lax.stop_gradient(value) - value
+    return problem.on_sides(y + delay @ lax.stop_gradient(jump), sides)
