@@ -62,7 +62,8 @@ class Problem(eqx.Module):
 
     def packed(self, q, v, integral=0.0, sides=()):
         """The vector that diffrax integrates."""
-        return jnp.concatenate([jnp.asarray(sides, q.dtype), q, v, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
+        first = [sides] if len(sides) else []
+        return jnp.concatenate([*first, q, v, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
 
     def _first(self, y):
         """Where q begins in such vectors: after the sides."""
@@ -76,7 +77,7 @@ class Problem(eqx.Module):
 
     def sides(self, y):
         """The sides of switches on which force elements are held, (m,); none where steps do not adapt to them."""
-        return y[: self._first(y)]
+        return y[: self._first(y)] if self._first(y) else ()
 
     def on_sides(self, y, sides):
         """The same vector with other sides."""
@@ -99,7 +100,8 @@ class Problem(eqx.Module):
             sides = self.sides(y)
             system = held(self.system, sides) if len(sides) else self.system
             v, acceleration, q, distance = self.method.derivative(system, t, *self.unpacked(y), correct)
-            return self.packed(rates(system.topology, q, v), acceleration, distance, jnp.zeros_like(sides))
+            still = jax.tree.map(jnp.zeros_like, sides)
+            return self.packed(rates(system.topology, q, v), acceleration, distance, still)
 
         return _apart(packed_rates, y, jnp.full_like(y, jnp.nan))
 

@@ -44,7 +44,7 @@ from linkax.simulation.results import (
 from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
-from linkax.simulation.switches import sides_of, values
+from linkax.simulation.switches import start_sides
 from linkax.simulation.undefined import undefined_where
 from linkax.tracing import all_known, compiled, runs_once
 
@@ -329,7 +329,7 @@ def _integrate(
     if not _saves_states(saveat):
         saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))
     q, v = outset.state.q, outset.state.v
-    sides = sides_of(values(problem.system, t0, q, v)) if controller.is_adaptive else ()
+    sides = start_sides(problem.system, t0, q, v) if controller.is_adaptive else ()
     y0 = problem.packed(q, v, sides=sides)
     event = _wrapped_event(event)
     integration = _Integration(

@@ -42,16 +42,15 @@ def held(system, sides):
 
 def values(system, t, q, v):
     """Values of all switches of force elements, (m,)."""
-    switching = [force for force in system.forces if has_switch(force)]
-    if not switching:
-        return jnp.zeros(0, q.dtype)
     motion = move(configure(system, t, q), v)
-    return jnp.stack([force.switched(t, motion) for force in switching])
+    return jnp.stack([force.switched(t, motion) for force in system.forces if has_switch(force)])
 
 
-def sides_of(values):
-    """The sides that values of switches are on."""
-    return jnp.where(values > 0.0, 1.0, -1.0).astype(values.dtype)
+def start_sides(system, t, q, v):
+    """The sides of switches, (m,), 1 or −1, that a state is on; () where there are none."""
+    if not any(map(has_switch, system.forces)):
+        return ()
+    return jnp.where(values(system, t, q, v) > 0.0, 1.0, -1.0).astype(q.dtype)
 
 
 def meet(problem, t0, t1, y0, y1, within):
