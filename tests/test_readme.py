@@ -12,13 +12,29 @@ import linkax as lx
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
 
-def test_a_force_of_ones_own():
-    block = next(text for text in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "class Drag" in text)
+def names_after(*classes):
+    """What the blocks that define classes leave, the mechanism of the first by name."""
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     names = {"jax": jax, "jnp": jnp, "lx": lx, "__name__": "readme"}
-    *_, last = block.strip().splitlines()
-    exec(block.replace(last, f"mechanism = {last}"), names)
+    for of in classes:
+        block = next(text for text in blocks if f"class {of}(" in text)
+        exec(block.replace("\nlx.Mechanism(", "\nmechanism = lx.Mechanism("), names)
+    return names
+
+
+def test_a_force_of_ones_own():
+    names = names_after("Drag")
     state = lx.State(jnp.zeros(1), jnp.array([3.0]))
     here = lx.Solution.of_state(names["mechanism"], state)
     # J θ'' of a rod of length and mass one about its end, under gravity and drag at its tip.
     exact = (-9.81 / 2.0 - 0.1 * 3.0**2) * 3.0
     np.testing.assert_allclose(here.acceleration("arm", at="tip")[0, 1], exact, rtol=1e-12)
+
+
+def test_a_force_with_a_switch():
+    buffered = names_after("Drag", "Buffer")["buffered"]
+    for angle in (0.1, -0.1):
+        here = lx.Solution.of_state(buffered, lx.State(jnp.array([angle]), jnp.zeros(1)))
+        push = 1e3 * max(-np.sin(angle), 0.0)
+        exact = (push - 9.81 / 2.0) * 3.0 * np.cos(angle) ** 2
+        np.testing.assert_allclose(here.acceleration("arm", at="tip")[0, 1], exact, rtol=1e-12)

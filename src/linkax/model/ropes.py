@@ -119,7 +119,7 @@ class ElasticRope(AbstractForce):
     """An elastic rope, without mass and friction, over points (small sheaves); slack where it is too long.
 
     It pulls with `stiffness` [N/m] (E A over the free length) × stretch + `damping` [N s/m] × rate of stretch, and
-    never pushes.
+    never pushes. With damping its pull jumps where it goes taut. Steps end where it goes taut and slack.
 
     **Arguments:** `points`: see `Rope`; `stiffness`; `free_length` [m]; `damping`.
     """
