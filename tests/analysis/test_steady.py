@@ -77,6 +77,7 @@ def _whirls(rate, soft):
     return found.natural_frequencies, found.modes
 
 
+@pytest.mark.slow
 def test_whirling_of_a_rotor():
     """Seen from the shaft at |ω₀ ± Ω|; of a shaft with two stiffnesses, unstable between its critical speeds."""
     frequencies, modes = _whirls(jnp.array([0.0, 4.0, 15.0, 9.5]), jnp.array([150.0, 200.0, 200.0, 162.0]))

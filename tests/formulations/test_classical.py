@@ -72,6 +72,7 @@ def _first_second(variant, chosen, all_rows=False):
     return lx.simulate(mechanism, state, t1=0.8, dt0=0.02, saveat=saveat, formulation=chosen, **FIXED)
 
 
+@pytest.mark.slow
 def test_violations_are_millions_of_times_larger_than_with_the_papers_formulation():
     """SC1 up to its first singular passage; with the usual parameters."""
     ours = _first_second("SC1", None).worst_violation()

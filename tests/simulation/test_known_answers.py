@@ -64,7 +64,9 @@ BOUNDS = {
 }
 
 
-@pytest.mark.parametrize("name", REDUNDANT)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if "-" in name else []) for name in REDUNDANT]
+)
 def test_redundant_and_coupled_mechanisms(name):
     known = REDUNDANT[name]
     found = known.simulate(accuracy=lx.PRECISE)

@@ -68,7 +68,10 @@ class RK4(diffrax.AbstractERK):
         return 4
 
 
-@pytest.mark.parametrize(("solver", "name"), [(RK4(), "SC2"), (diffrax.Dopri8(), "FL1")], ids=["RK4", "Dopri8"])
+@pytest.mark.parametrize(
+    ("solver", "name"),
+    [pytest.param(RK4(), "SC2", id="RK4"), pytest.param(diffrax.Dopri8(), "FL1", id="Dopri8", marks=pytest.mark.slow)],
+)
 def test_smaller_fixed_steps_are_never_worse(solver, name):
     run = PASSING[name]._replace(t1=5.0)
     errors = []
