@@ -5,11 +5,12 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from known_answers import start
 
 import linkax as lx
 from linkax.compiler import makes_kernels_of_loops
-from linkax.tracing import in_one_kernel
+from linkax.tracing import in_one_kernel, with_products_as_sums
 
 
 def motion(optimise=True):
@@ -30,8 +31,38 @@ def kernels():
     return {name: np.asarray(array).tolist() for name, array in told.items()} | {"loops": loop.count("while")}
 
 
+def products():
+    """Of functions of two matrices: found with products as sums, expected, and how many products are left."""
+    both = lambda a, b: jnp.einsum("ij,kj->ki", a, b)
+    stacked = lambda a: jnp.stack([a, 2.0 * a, a + 1.0])
+    batch = lambda a, b: jnp.einsum("ijk,kli->lij", stacked(a), stacked(b))
+    functions = {
+        "matrices": both,
+        "axes": batch,
+        "vector": lambda a, b: a @ b[0],
+        "numbers": lambda a, b: jnp.tensordot(a, b, 2),
+        "nothing": lambda a, b: a[:, :0] @ b[:0],
+        "branch": lambda a, b: lax.cond(a[0, 0] > 0.0, both, lambda a, b: a, a, b),
+        "loop": lambda a, b: lax.fori_loop(0, 3, lambda _, c: 0.1 * jax.jit(both)(a, c), b),
+        "several": lambda a, b: jax.vmap(lambda column: a @ column)(b),
+        "derivative": jax.grad(lambda a, b: jnp.sum(jnp.sin(both(a, b)))),
+        "large": lambda a, b: jnp.kron(a, jnp.ones((9, 9))) @ jnp.kron(b, jnp.ones((9, 9))),
+    }
+    generator = np.random.default_rng(1)
+    a, b = jnp.asarray(generator.normal(size=(2, 3, 3)))
+    told = {}
+    for name, function in functions.items():
+        summed = with_products_as_sums(function)
+        left = str(jax.make_jaxpr(summed)(a, b)).count("dot_general")
+        told[name] = np.asarray(summed(a, b)).tolist(), np.asarray(function(a, b)).tolist(), left
+    return told
+
+
 def assembled_inside(angle):
-    """The same end of a pendulum's motion, assembled and run in one program, and in programs of their own."""
+    """The same end of a pendulum's motion, assembled and run in one program, and in programs of their own.
+
+    `of_run`: whether its loops over steps are left as loops.
+    """
 
     def end(angle):
         arm = lx.rod("arm", 1.0, 1.0)
@@ -39,10 +70,14 @@ def assembled_inside(angle):
         mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -9.81, 0.0])])
         return lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": angle}), t1=0.5).q[-1, 0]
 
-    return [float(end(angle)), float(jax.jit(end)(angle))]
+    together = jax.jit(end).lower(angle).compile()
+    _, _, entry = together.as_text().partition("\nENTRY")
+    loops = [line for line in entry.splitlines() if " while(" in line or "xla_cpu_small_call" in line]
+    of_run = [" while(" in line for line in loops if "diffeqsolve" in line]
+    return {"ends": [float(end(angle)), float(together(angle))], "of_run": of_run}
 
 
 if __name__ == "__main__":
     motions = {"motion": motion(), "motion_once": motion(optimise=False)}
-    told = {"makes_kernels": makes_kernels_of_loops(), "kernels": kernels(), "assembled_inside": assembled_inside(0.4)}
-    print(json.dumps(told | motions))
+    told = {"makes_kernels": makes_kernels_of_loops(), "kernels": kernels(), "products": products()}
+    print(json.dumps(told | motions | {"assembled_inside": assembled_inside(0.4)}))

@@ -13,7 +13,7 @@ import pytest
 from compiled_as_users_do import motion
 
 from linkax import compiler
-from linkax.compiler import LOOPS, ROOM, makes_kernels_of_loops, set_flags
+from linkax.compiler import LOOPS, ROOM, makes_kernels_of_loops, quickest_to_compile, set_flags
 from linkax.tracing import runs_once
 
 
@@ -46,7 +46,7 @@ def test_how_a_run_is_compiled_changes_nothing_but_rounding(as_users_do, compile
 
 def test_assembly_may_be_part_of_a_program_with_callbacks(as_users_do):
     """Errors of Equinox call back to Python, which XLA finds no way to from some programs with loops."""
-    apart, together = as_users_do["assembled_inside"]
+    apart, together = as_users_do["assembled_inside"]["ends"]
     np.testing.assert_allclose(together, apart, rtol=1e-10)
 
 
@@ -56,6 +56,33 @@ def test_a_function_in_a_kernel_is_the_same_function(as_users_do):
     np.testing.assert_allclose(found["batch"], matrices @ matrices)
     assert found["count"] == 3
     assert np.all(np.isnan(found["none"]))
+
+
+def test_products_are_sums_where_loops_are_kernels(as_users_do):
+    """Of functions with branches, loops and derivatives too; all but those of large matrices."""
+    for name, (found, expected, products) in as_users_do["products"].items():
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15, err_msg=name)
+        assert (products > 0) == (name == "large"), name
+
+
+def test_the_loop_over_steps_is_one_kernel(as_users_do):
+    assert as_users_do["assembled_inside"]["of_run"] == [False]
+
+
+def test_slow_loops_are_told_once_unless_asked_for(monkeypatch):
+    """Flags that come too late, as XLA has read those of the tests."""
+    makes_kernels_of_loops.__wrapped__()
+    for flags in ("", LOOPS, "--xla_backend_extra_options=something"):
+        monkeypatch.setenv("XLA_FLAGS", flags)
+        with pytest.warns(RuntimeWarning, match=r"jaxlib .* no kernels of loops; import linkax before"):
+            makes_kernels_of_loops.__wrapped__()
+
+
+def test_options_that_a_version_does_not_know_are_left_out(monkeypatch):
+    known = quickest_to_compile()
+    assert known
+    monkeypatch.setattr(compiler, "QUICK", known | {"xla_cpu_no_such_option": True})
+    assert quickest_to_compile.__wrapped__() == known
 
 
 def test_flags_that_are_given_stay(monkeypatch):

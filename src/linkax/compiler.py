@@ -1,9 +1,12 @@
 """What linkax asks of XLA, the compiler behind JAX.
 
 XLA makes a kernel of each operation that it cannot fuse with others, and on a CPU it takes some 50 ns to start one:
-longer than it runs, where a mechanism is small. A loop on few numbers XLA compiles into one kernel instead. What is
-few, and whether products of matrices are left to a library, which such a loop cannot call, are set by flags that
-it reads once in a process, when JAX makes its first array.
+longer than it runs, where a mechanism is small. A loop on few numbers XLA compiles into one kernel instead, unless it
+calls a library, as for products of matrices (see `linkax.tracing.with_products_as_sums`). What is few is set by a flag
+that it reads once in a process, when JAX makes its first array.
+
+What a version of XLA does and knows is tried, as versions tell too little: it ends the process for a flag that it does
+not know, so the flag is one option among others in a list that it does not check.
 
 Most of the time to compile goes into optimisations, which a program that runs once does not earn back.
 
@@ -23,9 +26,13 @@ import jaxlib
 from jax import lax
 
 WHOLE_LOOP_BYTES = 2**22  # read and written by one pass of a loop
-LOOPS = f"--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold={WHOLE_LOOP_BYTES}"
-PRODUCTS = "--xla_cpu_experimental_ynn_fusion_type="
-KNOWN_VERSIONS = ("0.10",)  # a flag that XLA does not know ends the process
+LOOP_BYTES = "xla_cpu_small_while_loop_byte_threshold"
+LOOPS = f"--xla_backend_extra_options={LOOP_BYTES}={WHOLE_LOOP_BYTES}"
+QUICK = {  # to compile, not to run
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_use_fusion_emitters": False,
+}
 
 COMPILING = "/jax/core/compile/backend_compile_duration"  # what JAX tells its listeners before XLA compiles, and after
 ROOM = 10_000  # memory maps; the largest programs of linkax take 4000
@@ -34,20 +41,23 @@ MAPS, LIMIT_OF_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count"
 
 def set_flags():
     """Add to `XLA_FLAGS` what it does not name yet."""
-    flags = [LOOPS]
-    if jaxlib.__version__.startswith(KNOWN_VERSIONS):
-        flags.append(PRODUCTS)
     given = os.environ.get("XLA_FLAGS", "")
-    added = [flag for flag in flags if flag.partition("=")[0] not in given]
-    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+    if LOOPS.partition("=")[0] not in given:
+        os.environ["XLA_FLAGS"] = f"{given} {LOOPS}".strip()
 
 
+@cache
 def quickest_to_compile() -> dict:
-    """Options of `jax.jit`: half of the time to compile and less, for a program that is slower."""
-    options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-    if jaxlib.__version__.startswith(KNOWN_VERSIONS):
-        options["xla_cpu_use_fusion_emitters"] = False
-    return options
+    """Options of `jax.jit`, as far as XLA knows them: half of the time to compile and less, for a slower program."""
+    return {name: value for name, value in QUICK.items() if _is_known({name: value})}
+
+
+def _is_known(options) -> bool:
+    try:
+        jax.jit(lambda: 0, compiler_options=options).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 @cache
@@ -55,13 +65,22 @@ def makes_kernels_of_loops() -> bool:
     """Whether XLA makes one kernel of a loop like those of `linkax.tracing.in_one_kernel`.
 
     It does not where JAX had made an array before linkax was imported, where `XLA_FLAGS` say otherwise, and
-    in versions that know no such kernels.
+    in versions that know no such kernels. Warns, unless `XLA_FLAGS` ask for it, where runs on a CPU are slow for that.
     """
     with jax.ensure_compile_time_eval():
-        step = lambda carry: (carry[0] + 1, jnp.sin(carry[1] @ carry[1]))
+        step = lambda carry: (carry[0] + 1, jnp.sin(jnp.sum(carry[1][:, :, None] * carry[1], axis=1)))
         loop = jax.jit(lambda count, matrix: lax.while_loop(lambda carry: carry[0] < 3, step, (count, matrix)))
-        program = loop.lower(0, jax.ShapeDtypeStruct((32, 32), jnp.float32)).compile().as_text()
-    return "xla_cpu_small_call" in program
+        program = loop.lower(0, jax.ShapeDtypeStruct((8, 8), jnp.float64)).compile().as_text()
+    made, flags = "xla_cpu_small_call" in program, os.environ.get("XLA_FLAGS", "")
+    chosen = LOOP_BYTES in flags and LOOPS not in flags
+    if not made and not chosen and jax.default_backend() == "cpu":
+        warnings.warn(
+            f"runs take about five times as long as they could: jaxlib {jaxlib.__version__} makes no kernels of loops; "
+            f"import linkax before JAX makes its first array, with {LOOPS} in XLA_FLAGS, or install another jaxlib",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return made
 
 
 def watch_memory_maps():

@@ -6,15 +6,20 @@ where there are loops. Of a function marked `traced_once` JAX keeps what it has 
 compiles it in place, so that it runs as fast as without the mark.
 """
 
-from functools import partial, wraps
+import math
+from functools import cache, partial, wraps
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+from jax.extend.core.primitives import dot_general_p
 from jax.flatten_util import ravel_pytree
 
 from linkax.compiler import makes_kernels_of_loops, quickest_to_compile
+
+FEW_MULTIPLICATIONS = 2**12  # which take no longer as a sum than a library takes, see `with_products_as_sums`
 
 traced_once = eqx.filter_jit
 
@@ -29,7 +34,8 @@ def compiled(function):
 
     Of known numbers it is compiled in half of the time then, also inside of a transformation, which has no part in it.
     """
-    often, quick = traced_once(function), eqx.filter_jit(function, compiler_options=quickest_to_compile())
+    often = traced_once(function)
+    quick = cache(lambda: eqx.filter_jit(function, compiler_options=quickest_to_compile()))  # XLA is asked when it runs
 
     @wraps(function)
     def program(*args, once: bool):
@@ -37,7 +43,7 @@ def compiled(function):
             return often(*args)
         # Not `jax.ensure_compile_time_eval`: with it JAX compiles each operation on constants by itself.
         with jax.core.eval_context():
-            return quick(*args)
+            return quick()(*args)
 
     return program
 
@@ -63,7 +69,8 @@ def in_one_kernel(function, sound, *args):
     """function(*args), as one kernel of the CPU where that can be; no numbers where `sound` is false.
 
     Of a program on the CPU XLA starts each of its operations by itself, which takes longer than one on a few
-    numbers. A loop it compiles as a whole, see `linkax.compiler`, and this is a loop that runs once. In a batch,
+    numbers. A loop it compiles as a whole, see `linkax.compiler`, and this is a loop that runs once, without products
+    of matrices. In a batch,
     where one operation concerns many numbers, and on other devices it is no loop. Not to be differentiated backwards.
     """
     if not makes_kernels_of_loops():
@@ -78,7 +85,7 @@ def in_one_kernel(function, sound, *args):
         return jax.tree.map(lambda array, shape: lax.convert_element_type(array, shape.dtype), found, shapes)
 
     def looping(sound, dynamic):
-        once = lambda carry: (jnp.zeros_like(sound), plain(sound, dynamic))
+        once = lambda carry: (jnp.zeros_like(sound), with_products_as_sums(plain)(sound, dynamic))
         return lax.while_loop(lambda carry: carry[0], once, (sound, jax.tree.map(_undefined, shapes)))[1]
 
     @jax.custom_batching.custom_vmap
@@ -96,6 +103,72 @@ def in_one_kernel(function, sound, *args):
 
 def _undefined(shape):
     return jnp.full(shape.shape, jnp.nan if jnp.issubdtype(shape.dtype, jnp.inexact) else 0, shape.dtype)
+
+
+def with_products_as_sums(function):
+    """A function of arrays whose products of small matrices are sums of products of numbers, where loops are kernels.
+
+    XLA leaves products of matrices on a CPU to a library, which the kernel of a loop cannot call (jaxlib 0.12). Those
+    of transformations that have been applied within the function, and of functions of users, are among them.
+    """
+
+    @wraps(function)
+    def summed(*args):
+        if not makes_kernels_of_loops():
+            return function(*args)
+        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+        found = jaxpr_as_fun(_summed(traced, {}))(*jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+
+    return summed
+
+
+def _summed(part, known):
+    """A part of a traced function with products as sums; `known`: what has become of those before, by identity."""
+    if type(part) is tuple:  # of branches
+        return tuple(_summed(of, known) for of in part)
+    if not isinstance(part, Jaxpr | ClosedJaxpr):
+        return part
+    if id(part) not in known:
+        if isinstance(part, Jaxpr):
+            made = part.replace(eqns=[_summed_equation(equation, known) for equation in part.eqns])
+        else:
+            made = part.replace(jaxpr=_summed(part.jaxpr, known))
+        known[id(part)] = made
+    return known[id(part)]
+
+
+def _summed_equation(equation, known):
+    if equation.primitive is not dot_general_p:
+        return equation.replace(params={name: _summed(value, known) for name, value in equation.params.items()})
+    left, right, found = (of.aval for of in (*equation.invars, *equation.outvars))
+    axes = equation.params["dimension_numbers"]
+    summed = math.prod(left.shape[axis] for axis in axes[0][0])
+    of_one_kind = left.dtype == right.dtype == found.dtype and jnp.issubdtype(found.dtype, jnp.floating)
+    if not of_one_kind or found.size * summed > FEW_MULTIPLICATIONS:
+        return equation
+    (call,) = _sum_of_products(axes, *(jax.ShapeDtypeStruct(array.shape, array.dtype) for array in (left, right))).eqns
+    return equation.replace(primitive=call.primitive, params=call.params)
+
+
+@cache
+def _sum_of_products(axes, left, right):
+    """The call of what is `jax.lax.dot_general`: its axes are those shared, those of the left, those of the right."""
+    contracted, shared = axes
+    own = [
+        [i for i in range(array.ndim) if i not in (*c, *s)] for array, c, s in zip((left, right), *axes, strict=True)
+    ]
+    middle = len(shared[0]) + len(own[0])
+
+    @jax.jit
+    def sum_of_products(left, right):
+        left = lax.transpose(left, (*shared[0], *own[0], *contracted[0]))
+        right = lax.transpose(right, (*shared[1], *own[1], *contracted[1]))
+        left = lax.expand_dims(left, range(middle, middle + len(own[1])))
+        right = lax.expand_dims(right, range(len(shared[0]), middle))
+        return jnp.sum(left * right, axis=range(middle + len(own[1]), left.ndim))
+
+    return jax.make_jaxpr(sum_of_products)(left, right)
 
 
 def one_by_one(function):

@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from linkax.simulation.integration import Problem, Projected
-from linkax.tracing import materialised
+from linkax.tracing import materialised, with_products_as_sums
 
 NO_REVERSE = (
     "Reverse-mode derivatives of reverse-mode derivatives of a simulation do not exist. Take second derivatives "
@@ -194,7 +194,7 @@ def _forwards(solver, every, course, steps, restored, flat) -> Motion:
         steps=jnp.zeros_like(steps.ys).at[0].set(materialised(y0, changes.y0)) if every else None,
     )
     begin = jnp.zeros((), int), jnp.zeros((), int), y0, motion
-    return lax.while_loop(lambda carry: carry[0] < steps.count, one, begin)[-1]
+    return lax.while_loop(lambda carry: carry[0] < steps.count, with_products_as_sums(one), begin)[-1]
 
 
 def _reached(saved, j, t):
@@ -244,6 +244,7 @@ def _backwards(solver, course, steps, wanted, cotangent: Motion) -> Course:
     count = 0 if saved is None else jnp.sum(saved <= finish)
     saved_bar = None if saved is None else jnp.zeros_like(saved)
     begin = last, count - 1, cotangent.end, jax.tree.map(jnp.zeros_like, problem), zero, zero, saved_bar
+    one = with_products_as_sums(one)
     *_, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(lambda carry: carry[0] >= 0, one, begin)
     return eqx.filter(Course(problem_bar, y_bar, t0_bar, t1_bar, saved_bar), wanted)
 

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from linkax.tracing import with_products_as_sums
+
 ROWS = 16  # evaluated at a time: few share the price of one close to a singular configuration
 
 
@@ -16,6 +18,7 @@ def over_rows(function, saved, *arrays):
     **Arguments:** `function`: of one row of each array; `saved`: which rows were, (n,); arrays (n, ...).
     """
 
+    @with_products_as_sums
     def of_part(saved, *arrays):
         across = lambda array: saved.reshape(-1, *[1] * (array.ndim - 1))
         # A saved row stands in for others, whose infinite numbers would count as a singular configuration.
