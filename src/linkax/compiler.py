@@ -3,10 +3,11 @@
 XLA makes a kernel of each operation that it cannot fuse with others, and on a CPU it takes some 50 ns to start one:
 longer than it runs, where a mechanism is small. A loop on few numbers XLA compiles into one kernel instead, unless it
 calls a library, as for products of matrices (see `linkax.tracing.with_products_as_sums`). What is few is set by a flag
-that it reads once in a process, when JAX makes its first array.
+that it reads once in a process, when JAX makes its first array. XLA ends the process for a flag that it does not know,
+so this one is an option among others in a list that it does not check. Another, that leaves fewer products to a library
+in batches, is given to versions that are known to know it.
 
-What a version of XLA does and knows is tried, as versions tell too little: it ends the process for a flag that it does
-not know, so the flag is one option among others in a list that it does not check.
+What a version of XLA does is tried, as versions tell too little.
 
 Most of the time to compile goes into optimisations, which a program that runs once does not earn back.
 
@@ -28,6 +29,8 @@ from jax import lax
 WHOLE_LOOP_BYTES = 2**22  # read and written by one pass of a loop
 LOOP_BYTES = "xla_cpu_small_while_loop_byte_threshold"
 LOOPS = f"--xla_backend_extra_options={LOOP_BYTES}={WHOLE_LOOP_BYTES}"
+PRODUCTS = "--xla_cpu_experimental_ynn_fusion_type="
+KNOWN_VERSIONS = ("0.10.", "0.11.", "0.12.")  # of jaxlib, that know it
 QUICK = {  # to compile, not to run
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
@@ -41,9 +44,11 @@ MAPS, LIMIT_OF_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count"
 
 def set_flags():
     """Add to `XLA_FLAGS` what it does not name yet."""
-    given = os.environ.get("XLA_FLAGS", "")
-    if LOOPS.partition("=")[0] not in given:
-        os.environ["XLA_FLAGS"] = f"{given} {LOOPS}".strip()
+    given, flags = os.environ.get("XLA_FLAGS", ""), [LOOPS]
+    if jaxlib.__version__.startswith(KNOWN_VERSIONS):
+        flags.append(PRODUCTS)
+    added = [flag for flag in flags if flag.partition("=")[0] not in given]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
 
 @cache
