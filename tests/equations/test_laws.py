@@ -132,7 +132,7 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
         for force in system.forces
         if isinstance(force, (lx.Gravity, lx.Spring, lx.JointSpring, lx.ElasticRope, BeamElasticity))
     ]
-    loads = reduce(lx.Load.plus, [force.load(t, motion) for force in storing], lx.Load.none(system))
+    loads = reduce(lx.Load.plus, [force.applied(t, motion) for force in storing], lx.Load.none(system))
     released = loads.joint_force + dynamics.along_speeds(configuration, loads.force, loads.moment)
     momenta = jnp.concatenate(along(lambda t, q, v: momentum(system, t, q, v), solved))
     return {
