@@ -80,6 +80,7 @@ def test_frequency_on_the_tangent_space_of_a_redundant_loop():
     np.testing.assert_allclose(np.abs(mode), 1.0, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_derivative_of_an_equilibrium_and_of_a_frequency():
     def stretched(stiffness):
         body = lx.point_mass("body", 2.0)

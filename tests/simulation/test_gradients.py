@@ -145,12 +145,13 @@ def test_both_modes_agree_with_central_differences(scene, variant):
     assert np.max(off) <= 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "variant"),
     [
         ("crank-slider", "regular"),
-        pytest.param("crank-slider", "SC4", marks=pytest.mark.slow),
-        *(pytest.param(scene, None, marks=pytest.mark.slow) for scene in list(CASES)[1:]),
+        ("crank-slider", "SC4"),
+        *((scene, None) for scene in list(CASES)[1:]),
     ],
 )
 def test_forwards_agrees_with_integrated_sensitivities(scene, variant):
@@ -250,6 +251,7 @@ def test_times_of_a_driven_joint(modes):
     np.testing.assert_allclose(flat(jax.jit(motion)(t1, saved)), flat(expected(t1, saved)), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_masses_through_three_passages():
     """SC1 against the motion of the crank alone, by Lagrange's equation, differentiated as it is solved."""
     t1, gravity = 5.0, 9.81

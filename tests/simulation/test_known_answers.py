@@ -64,9 +64,13 @@ BOUNDS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if "-" in name else []) for name in REDUNDANT]
-)
+def marked(names):
+    """Those that take long to compile, and are like others, as slow ones."""
+    alike = ("rigid-crane", "planar-four-bar", "A02-2")
+    return [pytest.param(name, marks=[pytest.mark.slow] if name in alike else []) for name in names]
+
+
+@pytest.mark.parametrize("name", marked(REDUNDANT))
 def test_redundant_and_coupled_mechanisms(name):
     known = REDUNDANT[name]
     found = known.simulate(accuracy=lx.PRECISE)
@@ -90,7 +94,8 @@ def test_a_start_in_a_singular_configuration_is_at_distance_zero():
     assert found.singularity_distance()[0] <= 1e-15
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2])
 def test_energy_through_ten_turns(count):
     run = PASSING[f"A02-{count}"]._replace(t1=20.0)
     found = run.simulate(accuracy=lx.PRECISE)
@@ -127,7 +132,7 @@ CLOSED = {name: PASSING[name] for name in ("SC1", "SC3", "FL2", "A02-2")} | REDU
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", CLOSED)
+@pytest.mark.parametrize("name", marked(CLOSED))
 def test_violations_are_rounding(name, preset):
     known = CLOSED[name]._replace(t1=5.0) if CLOSED[name].times is None else CLOSED[name]
     position, velocity, acceleration = known.simulate(accuracy=PRESETS[preset]).worst_violation()

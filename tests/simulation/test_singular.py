@@ -22,8 +22,8 @@ PASSAGE = 2.5e-13
 MATRIX = [(diffrax.Dopri8(), name) for name in PASSING]
 MATRIX += [(diffrax.Dopri5(), name) for name in PASSING if name.startswith("SC")]
 MATRIX += [(diffrax.Tsit5(), name) for name in ("FL1", "FL2", "A02-1")]
-mark = lambda name: [pytest.mark.slow] if name == "A02-5" else []
-MARKED = [pytest.param(s, name, marks=mark(name), id=f"{type(s).__name__}-{name}") for s, name in MATRIX]
+mark = lambda s, name: [pytest.mark.slow] if name == "A02-5" or isinstance(s, diffrax.Dopri5) else []
+MARKED = [pytest.param(s, name, marks=mark(s, name), id=f"{type(s).__name__}-{name}") for s, name in MATRIX]
 
 
 @pytest.mark.parametrize(("solver", "name"), MARKED)
