@@ -69,7 +69,8 @@ def test_json_is_one_object_and_files_are_whole(capsys, tmp_path):
     assert found["result"] == "successful"
     assert len(found["final"]["bob"]) == 3
     assert found == json.loads((tmp_path / "summary.json").read_text())
-    kept = np.load(tmp_path / "trajectory.npz")
+    with np.load(tmp_path / "trajectory.npz") as file:
+        kept = dict(file)
     assert {"t", "q", "v", "coordinates", "energy", "rank", "position_bob", "force_pivot", "moment_pivot"} <= set(kept)
     assert kept["position_bob"].shape == (len(kept["t"]), 3)
     np.testing.assert_allclose(kept["position_bob"][-1], found["final"]["bob"])

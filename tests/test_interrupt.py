@@ -122,8 +122,9 @@ def test_a_run_keeps_its_motion_apart_from_that_of_a_whole_one(tmp_path):
     reached = lx.Solution.of_state(mechanism, lx.State(jnp.array([0.3]), jnp.zeros(1)), t=0.5)
     told = simulate.keeping(tmp_path, {"scene": "one"}, reached)()
     assert told == f"the motion until t = 0.5 s is in {tmp_path / 'trajectory-interrupted.npz'}"
-    kept = np.load(tmp_path / "trajectory-interrupted.npz")
-    assert {name: kept[name].tolist() for name in kept} == {
+    with np.load(tmp_path / "trajectory-interrupted.npz") as file:
+        kept = {name: array.tolist() for name, array in file.items()}
+    assert kept == {
         "t": [0.5], "q": [[0.3]], "v": [[0.0]], "coordinates": ["pivot"], "speeds": ["pivot"],
     }  # fmt: skip
     described = json.loads((tmp_path / "summary-interrupted.json").read_text())
