@@ -69,12 +69,9 @@ class Samples(NamedTuple):
         The one over two intervals misses the state in their middle by sixteen times as much.
         """
         t, missed = self.ts, np.full(len(self.ts), np.inf)
-        slopes = np.asarray(jax.vmap(lambda q, v: rates(system.topology, q, v))(self.q, self.v))
-        part = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
-        begin, end = 1.0 - part**2 * (3.0 - 2.0 * part), part**2 * (3.0 - 2.0 * part)
-        along = part * (1.0 - part) * (t[2:] - t[:-2])[:, None]
-        middle = begin * self.q[:-2] + end * self.q[2:]
-        middle += along * ((1.0 - part) * slopes[:-2] - part * slopes[2:])
+        places = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+        ends = (np.stack([part[:-2], part[2:]], axis=1) for part in (t, self.q, self.v))
+        middle = jax.vmap(lambda *interval: _on_cubic(system, *interval))(*ends, places)
         off = np.asarray(
             jax.vmap(lambda q, change: speeds(system.topology, q, change))(self.q[1:-1], middle - self.q[1:-1])
         )
@@ -252,6 +249,20 @@ def _between(solution, pairs, places):
     return values, np.concatenate(distances), np.concatenate(states)
 
 
+def _on_cubic(system, ts, qs, vs, place):
+    """Coordinates at a place from 0 to 1 between two states, by their cubic polynomial."""
+    duration, dtype = ts[1] - ts[0], qs.dtype
+    hermite = ThirdOrderHermitePolynomialInterpolation(
+        t0=jnp.zeros((), dtype),
+        t1=jnp.ones((), dtype),
+        y0=qs[0],
+        y1=qs[1],
+        k0=duration * rates(system.topology, qs[0], vs[0]),
+        k1=duration * rates(system.topology, qs[1], vs[1]),
+    )
+    return hermite.evaluate(place)
+
+
 @runs_once
 def between_states(mechanism, accuracy, rank_nearby, ts, qs, vs, places):
     """J at places between two states, times its right inverse G at the first; J G there; d and q at the places.
@@ -262,17 +273,8 @@ def between_states(mechanism, accuracy, rank_nearby, ts, qs, vs, places):
     system, method = system_of(mechanism, dtype), accuracy.method(dtype, rank_nearby)
 
     def at(ts, qs, vs, place):
-        duration = ts[1] - ts[0]
-        hermite = ThirdOrderHermitePolynomialInterpolation(
-            t0=jnp.zeros((), dtype),
-            t1=jnp.ones((), dtype),
-            y0=qs[0],
-            y1=qs[1],
-            k0=duration * rates(system.topology, qs[0], vs[0]),
-            k1=duration * rates(system.topology, qs[1], vs[1]),
-        )
-        q = on_manifold(system.topology, hermite.evaluate(place))
-        here, _, distance = method.right_inverse(system, ts[0] + place * duration, q)
+        q = on_manifold(system.topology, _on_cubic(system, ts, qs, vs, place))
+        here, _, distance = method.right_inverse(system, ts[0] + place * (ts[1] - ts[0]), q)
         before, right_inverse, _ = method.right_inverse(system, ts[0], qs[0])
         return here @ right_inverse, before @ right_inverse, distance, q
 
