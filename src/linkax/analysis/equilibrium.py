@@ -14,10 +14,12 @@ from jaxtyping import Array, Bool, Float, Int
 from linkax.analysis.steady import (
     AGREES,
     Nearby,
+    eigh,
     instants,
     largest_force,
     may_move,
     missed_rates,
+    of_missed_rate,
     system_in,
     widest_gap,
 )
@@ -40,7 +42,6 @@ OVERSHOOT = 0.5  # of the work on a step, which forces may do against it at its 
 NEUTRAL = 1e-12  # stiffness relative to the largest that counts as none
 ASIDE = 1e-3  # first step out of an unstable equilibrium [rad, lengths of the mechanism]; each next one doubles it
 
-_eigh = one_by_one(jnp.linalg.eigh)
 _pseudo_inverse = one_by_one(lambda matrix: jnp.linalg.pinv(matrix, rtol=NEUTRAL))
 
 # Equilibria need no mass, and forces differ less between soft and stiff directions than accelerations do.
@@ -164,13 +165,11 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
 def _check_steady(mechanism, ending, found, t):
     """Raise where drives do not move steadily."""
     still = "give a state with speeds of zero, for the equilibrium where drives hold"
-    for constraint, missed in zip(mechanism.constraints, np.asarray(ending.missed), strict=True):
-        if not missed <= AGREES:
-            raise EquilibriumError(
-                f"{constraint.described} asks for a rate that the state's speeds miss by {missed:.3g} of the largest "
-                f"at t = {float(t):.6g} s; make the state with linkax.assemble at that time, or {still}",
-                found,
-            )
+    missed = np.asarray(ending.missed)
+    misses = np.logical_not(missed <= AGREES)
+    if np.any(misses):
+        told = of_missed_rate(mechanism, missed, int(np.argmax(misses)), t)
+        raise EquilibriumError(f"{told}, or {still}", found)
     if ending.longest <= BALANCED_STEP and not ending.changes <= AGREES:
         driven = [constraint.described for constraint in mechanism.constraints if constraint.is_driven]
         raise EquilibriumError(
@@ -246,7 +245,7 @@ def _at_rest(system, t, q):
         q, _ = method.close(system, t, retract(system.topology, search.q, search.step), rest)
         here = _Balanced.of(system, method, t, q)
         force, stiffness = here.at_rest()
-        values, vectors = _eigh((stiffness + stiffness.T) / 2.0)
+        values, vectors = eigh((stiffness + stiffness.T) / 2.0)
         stiff = jnp.abs(values) > NEUTRAL * jnp.max(jnp.abs(values))
         along = vectors.T @ force
         downhill = vectors @ jnp.where(stiff, along / jnp.where(stiff, jnp.abs(values), 1.0), along)

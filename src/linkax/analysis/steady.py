@@ -20,11 +20,14 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known
 from linkax.simulation.state import State
+from linkax.tracing import one_by_one
 
 # Radians, or lengths of the mechanism, after which a motion is looked at again: incommensurable, so that what is
 # periodic does not repeat there.
 LATER = np.array([0.7, 1.9, 41.0])
 AGREES = 1e-6  # of speeds, and of forces
+
+eigh = one_by_one(jnp.linalg.eigh)
 
 
 def may_move(state: State) -> bool:
@@ -95,6 +98,16 @@ def missed_rates(system: System, t, q, v) -> Float[Array, " m"]:
     asked = rate(system, t)
     largest = jnp.maximum(fastest(system, v), jnp.max(jnp.abs(asked), initial=0.0))
     return jnp.abs(jacobian(configure(system, t, q)) @ v - asked) / jnp.where(largest > 0.0, largest, 1.0)
+
+
+def of_missed_rate(mechanism: Mechanism, missed, row: int, t) -> str:
+    """What asks for a rate that speeds miss, and the remedy; of `missed` those of constraints come last."""
+    constraint = row - len(missed) + len(mechanism.constraints)
+    what = mechanism.constraints[constraint].described if constraint >= 0 else "a loop"
+    return (
+        f"{what} asks for a rate that the state's speeds miss by {missed[row]:.3g} of the largest "
+        f"at t = {float(t):.6g} s; make the state with linkax.assemble at that time"
+    )
 
 
 def largest_force(motion: Motion) -> Float[Array, ""]:

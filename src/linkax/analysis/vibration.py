@@ -12,11 +12,13 @@ from jaxtyping import Array, Complex, Float
 from linkax.analysis.steady import (
     AGREES,
     Nearby,
+    eigh,
     fastest,
     instants,
     largest_force,
     may_move,
     missed_rates,
+    of_missed_rate,
     system_in,
     widest_gap,
 )
@@ -42,7 +44,6 @@ CONSTANT = 1e-5  # what coefficients and loops may change by, relative to them
 ROUNDING_ULPS = 1e5  # of the largest stiffness, which softer ones may be off by
 GROWS = 1e-6  # real part of an eigenvalue relative to it, below which the motion neither grows nor decays
 
-_eigh = one_by_one(jnp.linalg.eigh)
 _eig = one_by_one(lambda matrix: tuple(jnp.linalg.eig(matrix)))
 
 
@@ -224,12 +225,8 @@ def _check_steady(mechanism, state, t, steadiness):
     """Raise where the linearisation would not be constant."""
     missed, topology, when = np.asarray(steadiness.missed), mechanism.topology, f"at t = {float(t):.6g} s"
     if not np.max(missed, initial=0.0) <= AGREES:
-        row = int(np.argmax(missed)) - len(missed) + len(mechanism.constraints)
-        what = mechanism.constraints[row].described if row >= 0 else "a loop"
-        raise ValueError(
-            f"{what} asks for a rate that the state's speeds miss by {np.max(missed):.3g} of the largest {when}; make "
-            "the state with linkax.assemble at that time, or give it speeds of zero, where drives hold"
-        )
+        told = of_missed_rate(mechanism, missed, int(np.argmax(missed)), t)
+        raise ValueError(f"{told}, or give it speeds of zero, where drives hold")
     acceleration = np.asarray(steadiness.acceleration)
     if not steadiness.off <= NEAR:
         system = system_of(mechanism, state.q.dtype)
@@ -284,7 +281,7 @@ def _linearise(mechanism, state, t, count, moves):
         couples = jnp.max(jnp.abs(gyroscopic)) > UNFELT * fastest(system, moving.v) + rounding
     # What is not asked for has eigenvalues apart from each other, and so derivatives.
     apart = jnp.diag(jnp.arange(1.0, len(symmetric) + 1.0, dtype=system.dtype) ** 2)
-    values, vectors = _eigh(jnp.where(couples, apart, symmetric))
+    values, vectors = eigh(jnp.where(couples, apart, symmetric))
     frequencies = jnp.sign(values) * jnp.sqrt(jnp.where(values == 0.0, 1.0, jnp.abs(values)))
     if moves and count:
         matrix = _state_matrix(jnp.where(couples, symmetric, apart), jnp.where(couples, gyroscopic, 0.0))
@@ -308,7 +305,7 @@ class _Modes(NamedTuple):
 
     @staticmethod
     def of(system, basis, stiffness, v) -> "_Modes":
-        values, vectors = _eigh(stiffness)
+        values, vectors = eigh(stiffness)
         return _Modes(basis @ vectors, vectors, jnp.maximum(jnp.abs(values), fastest(system, v) ** 2))
 
 
