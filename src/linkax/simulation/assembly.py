@@ -13,11 +13,10 @@ from linkax.equations.loops import Gap, gaps
 from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
 from linkax.model.mechanism import Mechanism
-from linkax.simulation.accuracy import BALANCED
 from linkax.simulation.branch_speeds import other_speeds, speeds_on_branch
 from linkax.simulation.closing import CLOSED, Demand, closed
 from linkax.simulation.given import Given, by_joint, check_mechanism, checked_time, coordinates_by_joint, sound_numbers
-from linkax.simulation.nearest import beams_of
+from linkax.simulation.nearest import beams_of, rank_tolerance
 from linkax.simulation.outset import ON_BRANCH, moving_joints
 from linkax.simulation.state import State
 from linkax.tracing import all_known, runs_once
@@ -129,9 +128,10 @@ def _raise_if_open(mechanism, state, t, remainder):
                     f"the {what} asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not "
                     f"allow it together with the other {what}s given, so ask for fewer"
                 )
-    if not remainder.off_branch <= ON_BRANCH * BALANCED.method(state.q.dtype).rank_tolerance:
+    tolerance = rank_tolerance(state.q.dtype)
+    if not remainder.off_branch <= ON_BRANCH * tolerance:
         system = system_of(mechanism, state.q.dtype)
-        basis = Crossing.at(system, t, state.q, BALANCED.method(state.q.dtype).rank_tolerance).inverse.basis
+        basis = Crossing.at(system, t, state.q, tolerance).inverse.basis
         names = ", ".join(map(repr, moving_joints(system, t, state.q, basis)))
         raise AssemblyError(
             "the configuration is singular, and the speeds asked lie on no branch of the motion; its branches cross "

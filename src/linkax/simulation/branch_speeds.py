@@ -12,10 +12,9 @@ from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.formulations.branches import Crossing
 from linkax.linalg.constrained_solve import invert
-from linkax.simulation.accuracy import BALANCED
 from linkax.simulation.closing import CLOSED
 from linkax.simulation.given import Given
-from linkax.simulation.nearest import nearest
+from linkax.simulation.nearest import nearest, rank_tolerance
 from linkax.simulation.outset import ON_BRANCH
 from linkax.tracing import materialised, pushed_forward, runs_once
 
@@ -83,7 +82,7 @@ class _Asked(eqx.Module):
 def _on_branch(asked, v):
     """Speeds on a branch, by Newton steps from a little beside speeds v, which may lie just between two."""
     beside = BESIDE * jnp.sum(asked.crossing.inverse.basis, axis=1)
-    off = asked.off_branch(v) > ON_BRANCH * BALANCED.method(v.dtype).rank_tolerance
+    off = asked.off_branch(v) > ON_BRANCH * rank_tolerance(v.dtype)
     turn = lambda _, v: v + nearest(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
     # As many each time: with a loop that ends sooner XLA (jaxlib 0.10) finds no callbacks in the rest of the program.
     return lax.fori_loop(0, TURNS, turn, v + jnp.where(off, beside, 0.0))
@@ -100,7 +99,7 @@ def _on_branch_jvp(primals, changes):
 
 def _asked(configuration, held):
     system = configuration.system
-    crossing = Crossing.of(configuration, BALANCED.method(system.dtype).rank_tolerance)
+    crossing = Crossing.of(configuration, rank_tolerance(system.dtype))
     right = jnp.concatenate([rate(system, configuration.t), *held.values])
     largest = jnp.max(jnp.abs(right), initial=0.0)
     scale = lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))
@@ -134,7 +133,7 @@ def other_speeds(mechanism, held, t, q, v):
     """Speeds on other branches than v, with those of joints held: candidates, (k, n_v), and which of them are some."""
     configuration = configure(system_of(mechanism, q.dtype), t, q)
     asked = _asked(configuration, held)
-    tolerance = BALANCED.method(q.dtype).rank_tolerance
+    tolerance = rank_tolerance(q.dtype)
 
     def found(begin):
         other = _on_branch(asked, begin)

@@ -11,6 +11,11 @@ from linkax.model.beams import BeamElasticity
 from linkax.simulation.accuracy import BALANCED
 
 
+def rank_tolerance(dtype):
+    """For independent rows, of everything that is assembled."""
+    return BALANCED.method(dtype).rank_tolerance
+
+
 def beams_of(system):
     """The elastic forces of beams."""
     return [force for force in system.forces if isinstance(force, BeamElasticity)]
@@ -31,7 +36,7 @@ def nearest(system, x, slopes, right, tolerance=None):
     """What is nearest to x, in radians and lengths of the mechanism, with slopes @ x = right.
 
     Strains of beams differ from x, by as little energy as they can, only in what all else leaves open. `tolerance`:
-    for independent rows, by default that of `BALANCED`.
+    for independent rows, by default `rank_tolerance`.
     """
     strains, units = strains_of(system), system.units
     if not len(strains):
@@ -47,7 +52,7 @@ def nearest(system, x, slopes, right, tolerance=None):
 
 def nearest_in(metric, units, x, slopes, right, tolerance=None):
     """What is nearest to x in a metric, or in units for None, with slopes @ x = right."""
-    tolerance = BALANCED.method(x.dtype).rank_tolerance if tolerance is None else tolerance
+    tolerance = rank_tolerance(x.dtype) if tolerance is None else tolerance
     inverse = invert(metric, slopes, units, tolerance)
     metric = jnp.diag(units**-2) if metric is None else metric
     return constrained_solve(inverse, metric, slopes, metric @ x, right)[0]
