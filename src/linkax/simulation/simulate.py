@@ -19,7 +19,7 @@ from linkax.model.functions import Function
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import flag, instance, known
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.diagnosis import cause, in_words
+from linkax.simulation.diagnosis import cause
 from linkax.simulation.given import check_accuracy, checked_state, checked_time, sound_numbers
 from linkax.simulation.integration import MechanismControl, Problem, Projected
 from linkax.simulation.options import (
@@ -31,6 +31,7 @@ from linkax.simulation.options import (
     traced_tolerances,
 )
 from linkax.simulation.outset import Outset, depart
+from linkax.simulation.remarks import in_words
 from linkax.simulation.repeat import DEFAULT_SAVES, Repeat
 from linkax.simulation.replay import Course, Steps, integrate, is_replayable
 from linkax.simulation.results import (

@@ -17,11 +17,11 @@ from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import known, number, one_of, real, require
 from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.diagnosis import remark
 from linkax.simulation.given import check_accuracy, checked_state, checked_time, sound_numbers
 from linkax.simulation.instant import Instant, Pose, Power, Violation
 from linkax.simulation.integration import Problem
 from linkax.simulation.passages import Passages, passages
+from linkax.simulation.remarks import remark
 from linkax.simulation.results import REMARKS, RESULTS
 from linkax.simulation.rows import over_rows
 from linkax.simulation.state import State
