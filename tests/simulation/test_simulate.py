@@ -9,7 +9,8 @@ import pytest
 
 import linkax as lx
 from linkax.scenes import SCENES
-from linkax.simulation import segments
+from linkax.simulation import segments, solution
+from linkax.simulation.instant import Instant
 
 
 def pendulum(length=1.0, forces=()):
@@ -74,6 +75,37 @@ def test_a_run_in_segments_is_the_run(monkeypatch, worth, optimised):
     np.testing.assert_allclose([part.t_end for part in kept], np.linspace(0.0, 2.0, 21)[1:], rtol=1e-15)
     np.testing.assert_array_equal(kept[4].q, found.solution.q[:251])
     np.testing.assert_allclose(found.solution.q, whole.q, atol=1e-10)
+
+
+def test_a_time_saved_more_than_once_holds_one_state():
+    mechanism, times = pendulum(), np.array([0.0, 0.5, 0.5, 1.0, 1.0, 1.0])
+    state = lx.assemble(mechanism, {"pivot": 0.3})
+    run = lambda ts: lx.simulate(mechanism, state, t1=1.0, saveat=diffrax.SaveAt(ts=ts))
+    found, each = run(times), run(np.unique(times))
+    np.testing.assert_array_equal(found.ts, times)
+    np.testing.assert_array_equal(found.q, np.asarray(each.q)[[0, 1, 1, 2, 2, 2]])
+    # Traced ones change each by itself, as much as the polynomial between steps.
+    change = jnp.zeros(6).at[2].set(1.0)
+    moved = jax.jvp(lambda ts: run(ts).q, (jnp.asarray(times),), (change,))[1]
+    expected = np.where(np.arange(6)[:, None] == 2, np.asarray(found.v), 0.0)
+    np.testing.assert_allclose(moved, expected, rtol=1e-5)
+
+
+def test_a_reading_is_computed_once(monkeypatch):
+    mechanism, computed = pendulum(), []
+    found = lx.simulate(mechanism, lx.assemble(mechanism, {"pivot": 0.3}), t1=1.0)
+    compute = solution._of_times
+    watched = lambda of, *given, **how: computed.append(of) or compute(of, *given, **how)
+    monkeypatch.setattr(solution, "_of_times", watched)
+    first, again = found.reaction("pivot"), found.reaction("pivot")
+    np.testing.assert_array_equal(first.force, again.force)
+    assert computed == [Instant.solve, Instant.reactions]
+    found.violation()
+    assert computed[2:] == [Instant.violation_and_scales]
+    of_all, each = solution._of_solutions, id(found)
+    assert each in of_all
+    del found
+    assert each not in of_all
 
 
 def test_a_batch_equals_single_runs():

@@ -77,20 +77,25 @@ def traced_tolerances(controller):
 
 def check_saved_times(saveat, t0, t1, max_steps):
     """Whether the times to save are in order, from t0 to t1 [s], and steps that are saved have a largest number."""
-    if max_steps is None and saveat is not None and (saveat.dense or any(sub.steps for sub in _subs(saveat))):
+    if max_steps is None and (saveat.dense or any(sub.steps for sub in _subs(saveat))):
         raise ValueError("max_steps is None, and saveat keeps all steps; give their largest number, such as 4096")
     for ts in saved_times(saveat):
         _check_times(ts, "saveat: ts [s]", t0, t1)
 
 
+def saves_times(saveat) -> bool:
+    """Whether states are saved at given times, and nothing else."""
+    return jax.tree.structure(saveat) == jax.tree.structure(diffrax.SaveAt(ts=np.zeros(1)))
+
+
 def saved_times(saveat) -> list:
-    """All arrays of times in a `SaveAt`, or in None."""
+    """All arrays of times in a `SaveAt`."""
     return [sub.ts for sub in _subs(saveat) if sub.ts is not None]
 
 
 def _subs(saveat):
     is_sub = lambda node: isinstance(node, diffrax.SubSaveAt)
-    return [*filter(is_sub, jax.tree.leaves(None if saveat is None else saveat.subs, is_leaf=is_sub))]
+    return [*filter(is_sub, jax.tree.leaves(saveat.subs, is_leaf=is_sub))]
 
 
 def _check_times(ts, what, t0, t1):

@@ -18,9 +18,11 @@ from linkax.tracing import runs_once
 
 REFINEMENTS = 6
 POLISHES = 2
+ASIDE = 5e-3  # of the time since the state before: where the motion is looked at around a passage
 PRECISE = 3e-9  # of the whole time: what a polynomial between saved states may leave
 VANISHED = 0.1  # of the distances before and after: what a passage falls below
 TOGETHER = 1e-6  # of the whole time: passages that close are of several loops at once
+ALIKE = 1e-6  # relative: eigenvalues that pass through zero as one
 SINGULAR = 1e-4  # distance below which a state is on no side of a passage
 FASTEST = 10.0  # that distances change, per radian or length of the mechanism
 BATCH = 64  # intervals that one program looks at
@@ -129,7 +131,7 @@ def _passages(solution) -> list[_Found]:
         return []
     intervals = _candidates(solution, samples)
     pairs, missed = samples.pairs(intervals), samples.missed(system_of(solution.mechanism, solution.q.dtype))[intervals]
-    turned = [_turned(values) for values in _between(solution, pairs, np.ones(len(pairs.ts)))[0]]
+    turned = [change.turned() for change in _between(solution, pairs, np.ones(len(pairs.ts)))[0]]
     with_ends = np.repeat(np.arange(len(turned)), [len(ends) for ends in turned])
     pairs, missed = pairs.taken(with_ends), missed[with_ends]
     places, distances, states = _zeros(solution, pairs, np.concatenate([np.empty(0), *turned]))
@@ -159,9 +161,10 @@ def _close_enough(solution) -> Samples:
     if steps < len(samples.ts) or solution.repeat is None or not solution.repeat.has_parts:
         return samples
     (state, t0), found = solution.repeat.start, None
-    parts = -(-2 * steps // solution.repeat.num_intervals(solution))
+    saves = solution.repeat.num_saves(solution)
+    parts = -(-2 * steps // (saves - 1))
     for begin, end in itertools.pairwise(np.linspace(float(t0), float(solution.t_end), parts + 1)):
-        part = solution.repeat.part(solution, state, begin, end)
+        part = solution.repeat.part(solution, state, np.linspace(begin, end, saves))
         if result_name(part.result) not in ENDED_WELL:
             break
         more, state = Samples.of(part), part.end
@@ -183,41 +186,48 @@ def _polished(solution, pair, time, q) -> _Found:
     begin, accuracy = pair.ts[0], pair.ts[1] - pair.ts[0]
     if solution.repeat is None or not solution.repeat.has_parts:
         return _Found(float(time), q, float(accuracy))
-    state, count = State(jnp.asarray(pair.q[0]), jnp.asarray(pair.v[0])), solution.repeat.num_intervals(solution)
+    state = State(jnp.asarray(pair.q[0]), jnp.asarray(pair.v[0]))
     for _ in range(POLISHES):
-        # The last two of the states that are saved evenly lie on both sides.
-        part = solution.repeat.part(solution, state, begin, begin + (time - begin) / (1.0 - 0.5 / count))
+        aside = ASIDE * (time - begin)
+        part = solution.repeat.part(solution, state, np.array([begin, time - aside, time + aside]))
         if result_name(part.result) not in ENDED_WELL:
             break
-        ts, qs, vs = (np.asarray(of)[[0, -2, -1]] for of in (part.ts, part.q, part.v))
+        ts, qs, vs = (np.asarray(of)[:3] for of in (part.ts, part.q, part.v))
         ends = [Samples(*(of[[0, k]][None] for of in (ts, qs, vs)), pair.distances[None]) for k in (1, 2)]
-        f, g = (_smallest(_between(solution, end, np.ones(1))[0])[0] for end in ends)
+        f, g = (_between(solution, end, np.ones(1))[0][0].smallest() for end in ends)
         share = -f / (g - f) if g != f else 0.5
         before, time, q = time, ts[1] + share * (ts[2] - ts[1]), qs[1] + share * (qs[2] - qs[1])
         accuracy = abs(time - before)
     return _Found(float(time), q, float(accuracy))
 
 
-def _eigenvalues(change, projector):
-    """Of a change of J, on the rows that are independent, onto which J times its right inverse projects.
+class _Change(NamedTuple):
+    """J at a state times its right inverse G at one before, and J G there, which projects on the independent rows."""
 
-    Ones where a motion that diverged has left no numbers.
-    """
-    if not np.all(np.isfinite(change)):
-        return np.ones(len(change))
-    basis, _, _ = np.linalg.svd(projector)
-    basis = basis[:, : round(np.trace(projector))]
-    return np.linalg.eigvals(basis.T @ change @ basis)
+    change: np.ndarray
+    projector: np.ndarray
 
+    def eigenvalues(self):
+        """On the independent rows; ones where a motion that diverged has left no numbers."""
+        if not np.all(np.isfinite(self.change)):
+            return np.ones(len(self.change))
+        basis, _, _ = np.linalg.svd(self.projector)
+        basis = basis[:, : round(np.trace(self.projector))]
+        return np.linalg.eigvals(basis.T @ self.change @ basis)
 
-def _turned(values):
-    """The eigenvalues that have become negative."""
-    return values.real[values.real < -np.abs(values.imag)]
+    def turned(self):
+        """The eigenvalues that have become negative; of those that are the same, of loops that move alike, one."""
+        off = np.abs(self.change - self.projector)
+        if np.max(np.sum(off, axis=0), initial=0.0) * np.max(np.sum(off, axis=1), initial=0.0) < 1.0:
+            return np.empty(0)  # as the norm of what the eigenvalues differ from one by is below one
+        values = self.eigenvalues()
+        turned = np.sort(values.real[values.real < -np.abs(values.imag)])
+        return turned[np.diff(turned, prepend=-np.inf) > ALIKE * np.abs(turned)]
 
-
-def _smallest(values):
-    """The eigenvalues next to zero, each of several."""
-    return np.array([each[np.argmin(np.abs(each))].real for each in values])
+    def smallest(self):
+        """The eigenvalue next to zero."""
+        values = self.eigenvalues()
+        return values[np.argmin(np.abs(values))].real
 
 
 def _zeros(solution, pairs, ends):
@@ -228,25 +238,25 @@ def _zeros(solution, pairs, ends):
     for _ in range(REFINEMENTS if len(ends) else 0):
         (a, f), (b, g) = low, high
         places = a + (b - a) * f / (f - g)
-        values, distances, states = _between(solution, pairs, places)
-        value = _smallest(values)
+        changes, distances, states = _between(solution, pairs, places)
+        value = np.array([change.smallest() for change in changes])
         low = np.where(value > 0.0, (places, value), low)
         high = np.where(value > 0.0, high, (places, value))
     return places, distances, states
 
 
 def _between(solution, pairs, places):
-    """Eigenvalues (see `_passages`), distances and coordinates, at places from 0 to 1 between two states."""
-    values, distances, states = [], [np.zeros(0)], [np.zeros((0, solution.q.shape[-1]))]
+    """Changes of J (see `_passages`), distances and coordinates, at places from 0 to 1 between two states."""
+    changes, distances, states = [], [np.zeros(0)], [np.zeros((0, solution.q.shape[-1]))]
     for first in range(0, len(places), BATCH):
         taken = np.arange(first, min(first + BATCH, len(places)))
         filled = np.resize(taken, BATCH)  # one shape, so that one program serves
         given = (*pairs.taken(filled)[:3], places[filled])
         found = between_states(solution.mechanism, solution.accuracy, solution.rank_nearby, *given)
         change, projector, distance, q = (np.asarray(part)[: len(taken)] for part in found)
-        values += map(_eigenvalues, change, projector)
+        changes += map(_Change, change, projector)
         distances, states = [*distances, distance], [*states, q]
-    return values, np.concatenate(distances), np.concatenate(states)
+    return changes, np.concatenate(distances), np.concatenate(states)
 
 
 def _on_cubic(system, ts, qs, vs, place):

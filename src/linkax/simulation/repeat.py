@@ -57,19 +57,21 @@ class Repeat(eqx.Module):
             optimise=optimise,
         )
 
-    def part(self, solution, state, t0, t1):
-        """The motion from a state at t0 to t1 with the same options, saved evenly: by the same program if it can be."""
+    def part(self, solution, state, ts):
+        """The motion from a state at the first of some times to the last, saved there, with the same options.
+
+        By the same program where that saves as many.
+        """
         _, _, dt0, solver, controller, max_steps, optimise, _ = eqx.combine(self.arrays, self.rest)
-        saveat = diffrax.SaveAt(ts=np.linspace(t0, t1, len(solution.ts))) if self._saves_enough(solution) else None
+        padded = np.pad(ts, (0, self.num_saves(solution) - len(ts)), mode="edge")
         options = dict(solver=solver, stepsize_controller=controller, dt0=dt0, max_steps=max_steps, optimise=optimise)
-        return self._run(solution, state, t0=t0, t1=t1, accuracy=solution.accuracy, saveat=saveat, **options)
+        saveat, accuracy = diffrax.SaveAt(ts=padded), solution.accuracy
+        return self._run(solution, state, t0=ts[0], t1=ts[-1], accuracy=accuracy, saveat=saveat, **options)
 
-    def num_intervals(self, solution) -> int:
-        """Between the states that a part saves."""
-        return (len(solution.ts) if self._saves_enough(solution) else DEFAULT_SAVES) - 1
-
-    def _saves_enough(self, solution):
-        return eqx.combine(self.arrays, self.rest)[-1] and len(solution.ts) >= FEWEST
+    def num_saves(self, solution) -> int:
+        """States that a part saves at most."""
+        saves_times = eqx.combine(self.arrays, self.rest)[-1]
+        return len(solution.ts) if saves_times and len(solution.ts) >= FEWEST else DEFAULT_SAVES
 
     @property
     def start(self):

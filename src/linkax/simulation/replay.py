@@ -56,8 +56,7 @@ class Motion(NamedTuple):
 
 def is_replayable(solver, saveat, event, max_steps) -> bool:
     """Whether derivatives can be had from here: explicit Runge-Kutta steps, saved states and no event."""
-    sub = diffrax.SubSaveAt(t1=True) if saveat is None else saveat.subs
-    plain = isinstance(sub, diffrax.SubSaveAt) and not sub.steps and not (saveat is not None and saveat.dense)
+    plain = isinstance(saveat.subs, diffrax.SubSaveAt) and not saveat.subs.steps and not saveat.dense
     explicit = isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau)
     return plain and explicit and event is None and max_steps is not None
 

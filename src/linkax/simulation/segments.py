@@ -67,9 +67,12 @@ def simulate_in_segments(
     **Returns:** a `TimedRun`; its solution ends with the segment that failed, if one did.
     """
 
-    def run(start, t0, end, optimise):
+    segment = intervals // SEGMENTS
+
+    def run(start, t0, end, optimise, count=segment):
+        """A part of the run, saved after `count` intervals; all such share a program."""
         began = time.perf_counter()
-        times = np.linspace(t0, end, intervals + 1)
+        times = np.pad(np.linspace(t0, end, count + 1), (0, intervals - count), mode="edge")
         found = simulate(
             mechanism,
             start,
@@ -97,7 +100,7 @@ def simulate_in_segments(
         report("integrating", 1.0 / SEGMENTS)
     # A classical formulation keeps what it leaves open: a segment would begin on the loops again.
     if formulation is not None or not _is_long(first, run_s):
-        whole, run_s = run(state, 0.0, t1, optimised)
+        whole, run_s = run(state, 0.0, t1, optimised, intervals)
         keep(whole)
         return TimedRun(whole, compile_s, run_s, optimised)
     parts, whole = [first], _joined([first])
@@ -122,9 +125,7 @@ def _joined(parts) -> Solution:
     counted = {name: sum(part.stats[name] for part in parts) for name in parts[0].stats if name != "max_steps"}
     return dataclasses.replace(
         parts[-1],
-        ts=_thinned(parts, "ts"),
-        q=_thinned(parts, "q"),
-        v=_thinned(parts, "v"),
+        **{name: _one_after_another([getattr(part, name) for part in parts]) for name in ("ts", "q", "v")},
         stats=parts[-1].stats | counted,
         rank_nearby=np.max([part.rank_nearby for part in parts], axis=0),
         closest=min(part.closest for part in parts),
@@ -141,6 +142,8 @@ def _mean_distance(parts):
     return np.average([part.average for part in lasting], weights=durations) if lasting else parts[0].average
 
 
-def _thinned(parts, name):
-    first, *others = (np.asarray(getattr(part, name)) for part in parts)
-    return np.concatenate([first[::SEGMENTS], *(values[SEGMENTS::SEGMENTS] for values in others)])
+def _one_after_another(parts):
+    """What each saved; the first times of the others are the last ones of those before."""
+    saved = (len(parts[0]) - 1) // SEGMENTS
+    first, *others = (np.asarray(part) for part in parts)
+    return np.concatenate([first[: saved + 1], *(values[1 : saved + 1] for values in others)])

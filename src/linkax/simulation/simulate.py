@@ -28,6 +28,7 @@ from linkax.simulation.options import (
     check_steps,
     floating,
     saved_times,
+    saves_times,
     traced_tolerances,
 )
 from linkax.simulation.outset import Outset, depart
@@ -136,6 +137,9 @@ def simulate(
     instance(formulation, AbstractFormulation | None, "formulation", names)
     solver = default_solver(mechanism) if solver is None else solver
     dt0 = check_steps(solver, stepsize_controller, dt0, max_steps, t0, t1)
+    if saveat is None:
+        evenly = np.linspace if all_known((t0, t1)) else jnp.linspace
+        saveat = diffrax.SaveAt(ts=evenly(t0, t1, DEFAULT_SAVES))
     check_saved_times(saveat, t0, t1, max_steps)
     replayed = adjoint is None and _saves_states(saveat) and is_replayable(solver, saveat, event, max_steps)
     if adjoint is None:
@@ -168,7 +172,7 @@ def simulate(
     )
     saves = _saves_states(saveat)
     times, values = (found.ts, found.t_end), (found.ys, found.y_end)
-    end, saved = _closed(mechanism, accuracy, outset, formulation, times, values, saves, once=once)
+    end, saved = _closed(mechanism, accuracy, outset, formulation, times, values, saves, _firsts(saveat), once=once)
     solution = Solution(
         mechanism=mechanism,
         accuracy=accuracy,
@@ -187,7 +191,7 @@ def simulate(
         definiteness=outset.definiteness,
         interpolation=found.interpolation,
         repeat=Repeat.of(
-            simulate, state, t0, dt0, solver, stepsize_controller, max_steps, optimise, _saves_times(saveat)
+            simulate, state, t0, dt0, solver, stepsize_controller, max_steps, optimise, saves_times(saveat)
         ),
     )
     if all_known((found, end, saved)):
@@ -277,12 +281,7 @@ def _problem(mechanism, accuracy, outset, formulation) -> Problem:
 
 def _saves_states(saveat) -> bool:
     """Whether states are saved, and not functions of them."""
-    return saveat is None or (isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is _SAVE_STATE)
-
-
-def _saves_times(saveat) -> bool:
-    """Whether states are saved at given times, and nothing else."""
-    return jax.tree.structure(saveat) == jax.tree.structure(diffrax.SaveAt(ts=np.zeros(1)))
+    return isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is _SAVE_STATE
 
 
 class _Found(NamedTuple):
@@ -325,8 +324,6 @@ def _integrate(
     in_order, t0, t1, dt0, saveat = _in_order(t0, t1, dt0, saveat)
     problem = _problem(mechanism, accuracy, outset, formulation)
     problem = eqx.tree_at(lambda p: p.sound, problem, problem.sound & in_order)
-    if saveat is None:
-        saveat = diffrax.SaveAt(ts=jnp.linspace(t0, t1, DEFAULT_SAVES, dtype=dtype))
     if not _saves_states(saveat):
         saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))
     q, v = outset.state.q, outset.state.v
@@ -436,17 +433,26 @@ class _Integration(eqx.Module):
         return jnp.concatenate(parts)
 
 
+def _firsts(saveat):
+    """For each saved time the first row of that time, which may come more than once; None where times are traced."""
+    ts = known(saveat.subs.ts) if saves_times(saveat) else None
+    return None if ts is None else np.searchsorted(ts, ts)
+
+
 @compiled
-def _closed(mechanism, accuracy, outset, formulation, times, values, saves) -> tuple[State, State | None]:
+def _closed(mechanism, accuracy, outset, formulation, times, values, saves, firsts) -> tuple[State, State | None]:
     """The state at the end, and those that are saved, on the loops; infinite where none was saved."""
     problem = _problem(mechanism, accuracy, outset, formulation)
     (ts, t_end), (ys, y_end) = times, values
     if not saves:
         return problem.close(t_end, y_end), None
     # The end comes first, so that it is in the same part as times that were saved.
-    saved = jnp.concatenate([jnp.ones(1, bool), jnp.isfinite(ts)])
-    closed = over_rows(problem.close, saved, jnp.concatenate([t_end[None], ts]), jnp.concatenate([y_end[None], ys]))
-    later = lambda rows: jnp.where(saved[1:, None], rows[1:], jnp.inf)
+    saved = jnp.isfinite(ts)
+    once = saved if firsts is None else saved & (firsts == jnp.arange(len(ts)))
+    rows = [jnp.concatenate(parts) for parts in ((jnp.ones(1, bool), once), (t_end[None], ts), (y_end[None], ys))]
+    closed = over_rows(problem.close, *rows)
+    each = lambda rows: rows[1:] if firsts is None else rows[1:][firsts]
+    later = lambda rows: jnp.where(saved[:, None], each(rows), jnp.inf)
     return State(closed.q[0], closed.v[0]), State(later(closed.q), later(closed.v))
 
 

@@ -1,6 +1,7 @@
 """The motion that a simulation found, and what can be read from it."""
 
 import dataclasses
+import weakref
 from collections.abc import Callable
 from typing import Any, get_args
 
@@ -25,9 +26,9 @@ from linkax.simulation.remarks import remark
 from linkax.simulation.results import REMARKS, RESULTS
 from linkax.simulation.rows import over_rows
 from linkax.simulation.state import State
-from linkax.tracing import compiled
+from linkax.tracing import all_known, compiled
 
-FEW = 100_000  # times of all members: reading more, or beams, takes longer than compiling
+FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
 
 
 class Solution(eqx.Module):
@@ -359,9 +360,28 @@ def _over_times(function, solution, *details, dynamics=()):
     """Evaluate a function of an instant at all times of all members of a batch."""
     if solution.q is None:
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
-    few = solution.ts.size <= FEW and not solution.mechanism.beams
+    topology = solution.mechanism.topology
+    few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
     # With another solver it would compile anew.
-    return _of_times(function, dataclasses.replace(solution, repeat=None), dynamics, details, once=few)
+    read = lambda: _of_times(function, dataclasses.replace(solution, repeat=None), dynamics, details, once=few)
+    named = all(isinstance(detail, str) for detail in details)
+    if not named or solution.ts.ndim > 1 or not all_known(solution):
+        return read()
+    return _kept(solution, (function, *details), read)
+
+
+_of_solutions = {}  # what has been read from solutions that are alive, by their identity
+
+
+def _kept(solution, key, read):
+    """What `read` gives, once for a solution, while it lives: other names and readings ask for the same."""
+    if id(solution) not in _of_solutions:
+        _of_solutions[id(solution)] = {}
+        weakref.finalize(solution, _of_solutions.pop, id(solution))
+    kept = _of_solutions[id(solution)]
+    if key not in kept:
+        kept[key] = read()
+    return kept[key]
 
 
 @compiled
