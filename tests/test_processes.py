@@ -1,0 +1,68 @@
+"""Whole programs in processes of their own, each of which has to end: nothing waits for ever, on few cores or many."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import linkax as lx
+from linkax.scenes import SCENES
+
+LIMIT = 600.0  # seconds, on a machine that is busy; the command line takes less than 90 alone
+SOURCE = Path(lx.__file__).parents[1]
+SIMULATE = [sys.executable, "-c", "import sys; from linkax_command import main; sys.exit(main())", "simulate"]
+SWEEP = """
+import jax.numpy as jnp
+import linkax as lx
+from linkax.scenes import SCENES
+
+scene = SCENES["n-four-bar"]
+
+def run(speed):
+    parameters = scene.parameters | {"N": 20, "speed": speed}
+    mechanism = scene.mechanism(parameters)
+    found = lx.simulate(mechanism, scene.initial(mechanism, parameters), t1=1.5, accuracy=lx.DRAFT)
+    force, distance = found.reaction("pivot_3").force[-1], found.singularity_distance()
+    return {"force": force, "distance": distance, "result": found.result}
+
+print(len(lx.sweep(run, jnp.linspace(-1.0, -0.8, 4), chunk=4).failed))
+"""
+VARIANTS = [(scene, variant) for scene, of in SCENES.items() for variant in of.variants]
+ROWS = {"20": (20, None), "20 on one core": (20, 1), "40": (40, None)}
+
+
+def ended(command, cores=None):
+    """What a program prints, which ends well within the limit."""
+    environment = os.environ | {"PYTHONPATH": str(SOURCE)}
+    confine = None if cores is None else lambda: os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+    found = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, env=environment, preexec_fn=confine)
+    assert found.returncode == 0, found.stderr
+    return found.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "variant"), VARIANTS)
+def test_every_variant_by_the_command_line(scene, variant, tmp_path):
+    told = json.loads(ended([*SIMULATE, scene, "--variant", variant, "--json", "--out", str(tmp_path)]))
+    assert told["result"] == "successful"
+    assert (tmp_path / "mechanism.gif").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ROWS)
+def test_a_row_of_loops_by_the_command_line(case, tmp_path):
+    count, cores = ROWS[case]
+    run = ["n-four-bar", "--set", f"N={count}", "--t1", "20", "--preset", "precise", "--json", "--out", str(tmp_path)]
+    told = json.loads(ended([*SIMULATE, *run], cores))
+    assert told["result"] == "successful"
+    assert len(told["passages"]) == 20
+    assert (tmp_path / "mechanism.gif").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cores", [None, 1])
+def test_a_sweep_of_rows_of_loops(cores):
+    assert int(ended([sys.executable, "-c", SWEEP], cores)) == 0
