@@ -135,7 +135,7 @@ def test_derivatives_of_speeds_on_a_branch():
 
 def test_speeds_on_no_branch_are_found_out():
     with pytest.raises(lx.AssemblyError, match=r"lie on no branch.*'bearing', 'guide', 'crank_pin', 'wrist_pin'"):
-        upright({"bearing": 1.0, "guide": -1.0})
+        upright({"bearing": 1.0, "crank_pin": -1.0})
     mechanism, state = upright({"guide": -2.0})
     between = lx.State(state.q, state.v * jnp.array([1.0, 0.5, 0.5]))
     with pytest.raises(lx.SimulationError, match=r"before it began.*no branch.*'guide'") as failure:
@@ -144,7 +144,8 @@ def test_speeds_on_no_branch_are_found_out():
 
 
 def test_a_start_at_rest_that_is_not_unique_is_found_out():
-    mechanism, state = upright({})
+    mechanism, moving = upright({"guide": -2.0})
+    state = lx.State(moving.q, jnp.zeros_like(moving.v))
     with pytest.raises(lx.SimulationError, match=r"at rest in a singular.*not unique.*'bearing'") as failure:
         lx.simulate(mechanism, state, t1=0.5)
     assert failure.value.solution.result == lx.RESULTS.not_unique
@@ -172,7 +173,10 @@ def test_in_a_batch_a_start_without_branch_harms_no_other():
         found.passages()
 
 
-@pytest.mark.parametrize("asked", [{"base_x": -5.0}, {"base_x": -5.0, "base_y": -5.0}, {"base_y": 3.0}])
+@pytest.mark.parametrize(
+    "asked",
+    [{"base_x": -5.0}, {"base_x": -5.0, "base_y": -5.0}, pytest.param({"base_y": 3.0}, marks=pytest.mark.slow)],
+)
 def test_speeds_of_some_joints_are_completed_to_a_branch(asked):
     """Sarrus with straight legs, where each leg can turn either way: y² = x²."""
     straight = lambda asked: raised(-np.pi / 2, asked)
@@ -253,8 +257,8 @@ def test_sarrus_through_seven_passages(rtol):
         np.testing.assert_allclose(found.joint(name), known["gamma"], atol=max(1e3 * rtol, 3e-9))
 
 
-LEGS = {"base_x": -5.0, "base_y": -5.0, "knee_x": 10.0, "knee_y": 10.0}
-AFTER = np.array([0.0, 1e-3, 2e-3])
+LEGS = {"base_x": -5.0, "base_y": -5.0, "knee_x": 10.0}
+AFTER = np.linspace(0.0, 2e-3, 61)  # as many as in the table, so with the same program
 
 
 def reactions_around(angle):
@@ -265,7 +269,7 @@ def reactions_around(angle):
     )
     after, before = (run(sign).reactions() for sign in (1.0, -1.0))
     stack = lambda found: np.stack([np.concatenate(found[name], axis=-1) for name in sorted(found)], axis=1)
-    return stack(after)[0], 0.5 * (stack(after) + stack(before))[1:]
+    return stack(after)[0], 0.5 * (stack(after) + stack(before))[[30, 60]]
 
 
 def test_reactions_in_a_singular_configuration_are_limits():
