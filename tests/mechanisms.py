@@ -157,6 +157,17 @@ def floating(seed):
     return lx.Mechanism(bodies, joints, forces)
 
 
+def cut(seed):
+    """Joints of all types cut, to ground and between two bodies in turn."""
+    numbers = Numbers(seed)
+    a, b = numbers.body("a"), numbers.body("b")
+    joints = [numbers.joint(lx.Revolute, "hinge", lx.GROUND, a), numbers.joint(lx.Spherical, "ball", b, a)]
+    for i, kind in enumerate(KINDS):
+        options = {"cut": True} if kind.can_carry else {}
+        joints.append(numbers.joint(kind, f"cut_{i}", (lx.GROUND, a)[i % 2], b, **options))
+    return lx.Mechanism([a, b], joints, [GRAVITY])
+
+
 def driven(seed):
     """A drive and a coupling in loops that share joints, under all forces along joints."""
     numbers = Numbers(seed)
@@ -226,6 +237,7 @@ POOL = {
     "planar": lambda seed: crank_slider(rod=1.0 + Numbers(seed).positive()),
     **{kind.__name__: lambda seed, kind=kind: both_roles(kind, seed) for kind in KINDS},
     "floating": floating,
+    "cut": cut,
     "driven": driven,
     "bending": bending,
 }

@@ -160,7 +160,13 @@ def drawn(name, seed):
     return laws(mechanism, jnp.array(0.3), *state_of(mechanism, seed))
 
 
-@pytest.mark.parametrize("name", POOL)
+# Joints of the other types are in "floating", "driven" and "bending" in the tree, and in "cut" cut.
+QUICK = ("planar", "Spherical", "Screw", "Distance", "floating", "cut", "driven", "bending")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in POOL]
+)
 def test_laws(name):
     @DRAWS
     @given(st.integers(0, 10_000))
