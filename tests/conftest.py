@@ -1,3 +1,4 @@
+import gc
 import os
 import sys
 import tempfile
@@ -18,6 +19,9 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": _compiled.name, "EQX_ON_ERROR": "nan"}
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
+# Programs without lines of source code in them: less to lower and to carry along.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+
 import jax
 import pytest
 from hypothesis import Phase, settings
@@ -32,6 +36,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 # Files that take longest begin first, so that at the end no process waits for another.
 LONGEST = ("test_notebooks", "test_gradients", "test_joints_in_motion", "test_singular_starts", "test_known_answers")
+gc.set_threshold(20_000, 20, 50)  # tracing makes many objects at a time, few of them in cycles
 MOST_MAPS = 40_000  # of the 65 530 that Linux gives a process; beyond them the compiler crashes
 
 
@@ -46,3 +51,4 @@ def _room_for_compiled_programs():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
+        gc.collect()
