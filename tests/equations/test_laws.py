@@ -161,7 +161,7 @@ def drawn(name, seed):
 
 
 # Joints of the other types are in "floating", "driven" and "bending" in the tree, and in "cut" cut.
-QUICK = ("planar", "Spherical", "Screw", "Distance", "floating", "cut", "driven", "bending")
+QUICK = ("planar", "Screw", "floating", "cut", "driven", "bending")
 
 
 @pytest.mark.parametrize(
