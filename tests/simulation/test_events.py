@@ -79,7 +79,7 @@ def test_root_of_an_event_in_a_loop(adjoint, derivative):
     np.testing.assert_allclose(slope, derivative(exact)(1.8), atol=1e-8)
 
 
-@pytest.mark.parametrize(("adjoint", "derivative"), [MODES[0], pytest.param(*MODES[1], marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("adjoint", "derivative"), [pytest.param(*MODES[0], marks=pytest.mark.slow), MODES[1]])
 def test_end_of_a_step_has_no_derivative(adjoint, derivative):
     """Without a root finder a run ends with a step, which follows no number: saved times before it do."""
 
