@@ -22,7 +22,7 @@ PASSAGE = 2.5e-13
 MATRIX = [(diffrax.Dopri8(), name) for name in PASSING]
 MATRIX += [(diffrax.Dopri5(), name) for name in PASSING if name.startswith("SC")]
 MATRIX += [(diffrax.Tsit5(), name) for name in ("FL1", "FL2", "A02-1")]
-mark = lambda s, name: [pytest.mark.slow] if name == "A02-5" or isinstance(s, diffrax.Dopri5) else []
+mark = lambda s, name: [pytest.mark.slow] if name in ("A02-2", "A02-5") or not isinstance(s, diffrax.Dopri8) else []
 MARKED = [pytest.param(s, name, marks=mark(s, name), id=f"{type(s).__name__}-{name}") for s, name in MATRIX]
 
 
@@ -42,7 +42,7 @@ def test_tighter_tolerances_are_never_worse(solver, name):
         assert steps[3] <= 3 * steps[2]
 
 
-@pytest.mark.parametrize("count", [1, 2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [1, *(pytest.param(count, marks=pytest.mark.slow) for count in (2, 5))])
 def test_row_of_four_bars_stays_on_its_branch(count):
     found = lx.simulate(*start("n-four-bar", "A02", {"N": count}), t1=10.0, accuracy=lx.PRECISE)
     error = found.position("link_0", at="tip")[-1, :2] - n_four_bar(10.0, count)
