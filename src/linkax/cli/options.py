@@ -30,7 +30,7 @@ def add_run_options(parser):
     parser.add_argument("--set", dest="changes", action="append", default=[], metavar="NAME=VALUE", help="a parameter")
     parser.add_argument("--preset", default="balanced", type=one_of(PRESETS), help=f"{', '.join(PRESETS)}")
     parser.add_argument("--rtol", type=positive, metavar="X", help="tolerance of a step, instead of the preset's")
-    solvers = f"{', '.join(SOLVERS)} (default: kvaerno5 for scenes with beams, dopri8 for others)"
+    solvers = f"{', '.join(SOLVERS)} (default: dopri8, or kvaerno5 for damped beams)"
     parser.add_argument("--solver", type=one_of(SOLVERS), help=solvers)
     parser.add_argument("--dt", type=positive, metavar="S", help="fixed steps [s], instead of ones that adapt")
     parser.add_argument("--out", type=_path, metavar="DIR", help="folder for the files (default: under linkax-out)")
@@ -51,7 +51,9 @@ class Run:
         self.accuracy = PRESETS[arguments.preset] if arguments.rtol is None else lx.Accuracy(rtol=arguments.rtol)
         self.mechanism = self.scene.mechanism(self.parameters)
         asked = arguments.solver
-        self.solver = default_solver(self.mechanism) if asked is None else SOLVERS[asked]()
+        tolerance = None if arguments.dt else self.accuracy.rtol
+        default = default_solver(self.mechanism, tolerance, self.t1)
+        self.solver = default if asked is None else SOLVERS[asked]()
         self.points = self.scene.points(self.parameters)
         self.described = {
             "scene": self.scene.name,

@@ -150,6 +150,19 @@ class Beam(AbstractBody):
         return self.length / self.elements
 
     @property
+    def fastest_frequency(self) -> Float[Array, ""]:
+        """Of its natural frequencies the highest, about [rad/s]: of waves as short as its elements.
+
+        Masses that it carries lower that little. Factors as found for beams of 2 to 8 elements, within a third.
+        """
+        section, size = self.section, self.element_length
+        along, across = 5.5 / size, 50.0 / size**2
+        orders = along, across, across, along, along, along
+        inertias = jnp.sum(section.rotary_inertia), *5 * (section.linear_density,)
+        of = [orders[strain] * jnp.sqrt(section.stiffness(strain) / inertias[strain]) for strain in self.strains]
+        return jnp.max(jnp.stack(of))
+
+    @property
     def nodes(self) -> tuple[str, ...]:
         """Names of the sections at its nodes, from the base to the tip."""
         return tuple(self._section(node) for node in range(self.elements + 1))

@@ -14,7 +14,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.results import RESULTS
-from linkax.simulation.simulate import DEFAULT_MAX_STEPS, fixed_steps, simulate
+from linkax.simulation.simulate import DEFAULT_MAX_STEPS, default_solver, fixed_steps, simulate
 from linkax.simulation.solution import Solution
 from linkax.simulation.state import State
 
@@ -68,6 +68,8 @@ def simulate_in_segments(
     """
 
     segment = intervals // SEGMENTS
+    if solver is None:  # one for all parts
+        solver = default_solver(mechanism, None if step else accuracy.rtol, t1)
 
     def run(start, t0, end, optimise, count=segment):
         """A part of the run, saved after `count` intervals; all such share a program."""

@@ -51,6 +51,9 @@ from linkax.simulation.undefined import undefined_where
 from linkax.tracing import all_known, compiled, runs_once
 
 DEFAULT_MAX_STEPS = 16**4
+CRITICAL = 2.0  # frequency times damping: waves that do not turn any more
+LOOSE = 1e-5  # tolerance
+LONG = 0.5 * DEFAULT_MAX_STEPS  # radians of the fastest wave, of which an explicit step takes 2 to 3
 _SAVE_STATE = diffrax.SubSaveAt(t1=True).fn
 
 
@@ -135,7 +138,10 @@ def simulate(
         formulation = named_formulation(formulation)
     names = "give a name, a linkax.ClassicalFormulation, or None"
     instance(formulation, AbstractFormulation | None, "formulation", names)
-    solver = default_solver(mechanism) if solver is None else solver
+    if solver is None:
+        control = MechanismControl(stepsize_controller)
+        rtol = control.tolerances((accuracy.rtol, accuracy.atol))[0] if control.is_adaptive else None
+        solver = default_solver(mechanism, rtol, t1 - t0)
     dt0 = check_steps(solver, stepsize_controller, dt0, max_steps, t0, t1)
     if saveat is None:
         evenly = np.linspace if all_known((t0, t1)) else jnp.linspace
@@ -203,9 +209,24 @@ def simulate(
     return solution
 
 
-def default_solver(mechanism: Mechanism) -> diffrax.AbstractSolver:
-    """`Kvaerno5`, implicit, for mechanisms with beams, whose fast waves are not to choose the steps; else `Dopri8`."""
-    return diffrax.Kvaerno5() if mechanism.beams else diffrax.Dopri8()
+def default_solver(mechanism: Mechanism, rtol, duration) -> diffrax.AbstractSolver:
+    """`Dopri8`, or for some mechanisms with beams `Kvaerno5`, implicit, whose steps fast waves do not choose.
+
+    Of undamped waves an implicit solver has to follow those that the motion excites as an explicit one does, with lower
+    order and at ten times the cost of a step. It is better where they are damped faster than they turn, where the
+    tolerance is loose, and in runs so long that they keep an explicit one from their end.
+
+    **Arguments:** `rtol`: tolerance of a step, None for fixed steps; `duration` [s]. Where these or numbers of beams
+    are traced by JAX, beams get `Kvaerno5`.
+    """
+    if not mechanism.beams:
+        return diffrax.Dopri8()
+    frequencies = jnp.stack([beam.fastest_frequency for beam in mechanism.beams])
+    dampings = jnp.stack([jnp.asarray(beam.damping) for beam in mechanism.beams])
+    if rtol is None or not all_known((rtol, duration, frequencies, dampings)):
+        return diffrax.Kvaerno5()
+    damped, long = jnp.any(frequencies * dampings > CRITICAL), jnp.max(frequencies) * duration > LONG
+    return diffrax.Kvaerno5() if rtol >= LOOSE or damped or long else diffrax.Dopri8()
 
 
 def fixed_steps(step: float | None, t1: float) -> dict:
