@@ -14,7 +14,7 @@ import linkax as lx
 from linkax.scenes import scene
 from linkax.simulation.files import remove_unfinished, writable_folder, written_whole
 from linkax.simulation.runge_kutta import RungeKutta4
-from linkax.simulation.simulate import default_solver
+from linkax.simulation.solvers import default_solver
 from linkax_command import at_interrupt
 
 PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}

@@ -14,8 +14,9 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.accuracy import BALANCED, Accuracy
 from linkax.simulation.results import RESULTS
-from linkax.simulation.simulate import DEFAULT_MAX_STEPS, default_solver, fixed_steps, simulate
+from linkax.simulation.simulate import DEFAULT_MAX_STEPS, fixed_steps, simulate
 from linkax.simulation.solution import Solution
+from linkax.simulation.solvers import default_solver
 from linkax.simulation.state import State
 
 SEGMENTS = 20

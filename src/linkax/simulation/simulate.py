@@ -45,15 +45,13 @@ from linkax.simulation.results import (
 )
 from linkax.simulation.rows import over_rows
 from linkax.simulation.solution import Solution
+from linkax.simulation.solvers import default_solver
 from linkax.simulation.state import State
 from linkax.simulation.switches import start_sides
 from linkax.simulation.undefined import undefined_where
 from linkax.tracing import all_known, compiled, runs_once
 
 DEFAULT_MAX_STEPS = 16**4
-CRITICAL = 2.0  # frequency times damping: waves that do not turn any more
-LOOSE = 1e-5  # tolerance
-LONG = 0.5 * DEFAULT_MAX_STEPS  # radians of the fastest wave, of which an explicit step takes 2 to 3
 _SAVE_STATE = diffrax.SubSaveAt(t1=True).fn
 
 
@@ -91,7 +89,8 @@ def simulate(
     - `saveat`: as in diffrax; default 201 times, evenly from t0 to t1. What is saved lies on the
       closed loops, as does the `State` that a `fn` of its own gets by (t, state, mechanism), but for
       classical formulations without a correction.
-    - `solver`: a diffrax solver, see `default_solver`.
+    - `solver`: a diffrax solver; default `Dopri8`, for some mechanisms with beams `Kvaerno5`, see
+      `linkax.simulation.solvers`.
     - `stepsize_controller`: replaces rtol and atol of `accuracy`. It sees coordinates in radians
       and lengths of the mechanism, each of magnitude one, and speeds relative to the largest.
     - `adjoint`: of diffrax. By default both modes work, over the steps that the run took, where the solver is an
@@ -207,26 +206,6 @@ def simulate(
         elif (remark := remark_name(solution.remark())) != "none":
             warnings.warn(in_words(solution, remark).lstrip(), WARNINGS[remark], stacklevel=2)
     return solution
-
-
-def default_solver(mechanism: Mechanism, rtol, duration) -> diffrax.AbstractSolver:
-    """`Dopri8`, or for some mechanisms with beams `Kvaerno5`, implicit, whose steps fast waves do not choose.
-
-    Of undamped waves an implicit solver has to follow those that the motion excites as an explicit one does, with lower
-    order and at ten times the cost of a step. It is better where they are damped faster than they turn, where the
-    tolerance is loose, and in runs so long that they keep an explicit one from their end.
-
-    **Arguments:** `rtol`: tolerance of a step, None for fixed steps; `duration` [s]. Where these or numbers of beams
-    are traced by JAX, beams get `Kvaerno5`.
-    """
-    if not mechanism.beams:
-        return diffrax.Dopri8()
-    frequencies = jnp.stack([beam.fastest_frequency for beam in mechanism.beams])
-    dampings = jnp.stack([jnp.asarray(beam.damping) for beam in mechanism.beams])
-    if rtol is None or not all_known((rtol, duration, frequencies, dampings)):
-        return diffrax.Kvaerno5()
-    damped, long = jnp.any(frequencies * dampings > CRITICAL), jnp.max(frequencies) * duration > LONG
-    return diffrax.Kvaerno5() if rtol >= LOOSE or damped or long else diffrax.Dopri8()
 
 
 def fixed_steps(step: float | None, t1: float) -> dict:
