@@ -247,6 +247,24 @@ def test_many_starts_next_to_a_singular_configuration():
         assert np.max(errors_of_starts(states, angles, speeds, rtol)) <= 100.0 * rtol
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "starts"), [(1, 166), (2, 167), (3, 167)])
+def test_many_starts_of_rows_of_loops_with_all_links_in_line(count, starts):
+    """Against the pendulum that moves alike."""
+    scene, generator, times = SCENES["n-four-bar"], np.random.default_rng(count), np.linspace(0.0, 0.5, 6)
+    for rtol in np.repeat([1e-4, 1e-8, 1e-12], starts):
+        distance = generator.choice([-1.0, 1.0]) * 10.0 ** generator.uniform(-14.0, -1.0)
+        speed = generator.choice([-1.0, 1.0]) * generator.uniform(0.5, 6.0)
+        asked = {"N": count, "angle": generator.choice([0.0, np.pi]) + distance, "speed": speed}
+        settings = scene.settings("A02", asked)
+        mechanism = scene.mechanism(settings)
+        state = scene.initial(mechanism, settings)
+        saveat = diffrax.SaveAt(ts=times)
+        found = lx.simulate(mechanism, state, t1=0.5, accuracy=lx.Accuracy(rtol=rtol), saveat=saveat, optimise=False)
+        expected = scene.exact(settings, times)["B0"]
+        np.testing.assert_allclose(found.position("link_0", "tip"), expected, atol=100.0 * rtol, err_msg=str(asked))
+
+
 @pytest.mark.parametrize("rtol", [1e-8, 1e-12])
 def test_sarrus_through_seven_passages(rtol):
     """Redundant throughout; the rank falls by one and by two."""
