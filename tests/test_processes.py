@@ -11,9 +11,7 @@ import pytest
 import linkax as lx
 from linkax.scenes import SCENES
 
-LIMIT = (
-    1800.0  # seconds, on a machine that is busy; most take less than 90, the telescopic crane five minutes to compile
-)
+LIMIT = 1800.0  # seconds, where others work too; most take less than 90 alone, the telescopic crane five minutes
 SOURCE = Path(lx.__file__).parents[1]
 SIMULATE = [sys.executable, "-c", "import sys; from linkax_command import main; sys.exit(main())", "simulate"]
 SWEEP = """

@@ -51,9 +51,10 @@ class Run:
         self.accuracy = PRESETS[arguments.preset] if arguments.rtol is None else lx.Accuracy(rtol=arguments.rtol)
         self.mechanism = self.scene.mechanism(self.parameters)
         asked = arguments.solver
-        tolerance = None if arguments.dt else self.accuracy.rtol
-        default = default_solver(self.mechanism, tolerance, self.t1)
-        self.solver = default if asked is None else SOLVERS[asked]()
+        if asked is None:
+            self.solver = default_solver(self.mechanism, None if arguments.dt else self.accuracy.rtol, self.t1)
+        else:
+            self.solver = SOLVERS[asked]()
         self.points = self.scene.points(self.parameters)
         self.described = {
             "scene": self.scene.name,

@@ -138,8 +138,7 @@ def simulate(
     names = "give a name, a linkax.ClassicalFormulation, or None"
     instance(formulation, AbstractFormulation | None, "formulation", names)
     if solver is None:
-        control = MechanismControl(stepsize_controller)
-        rtol = control.tolerances((accuracy.rtol, accuracy.atol))[0] if control.is_adaptive else None
+        rtol, _ = MechanismControl(stepsize_controller).tolerances((None, None))
         solver = default_solver(mechanism, rtol, t1 - t0)
     dt0 = check_steps(solver, stepsize_controller, dt0, max_steps, t0, t1)
     if saveat is None:
