@@ -31,7 +31,7 @@ SMALLEST = 1e-30  # keeps a loop from being the same in each pass, and changes n
 
 def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
     """Of an evaluation at a state."""
-    method, system = lx.BALANCED.method(float), system_of(mechanism, float)
+    method, system = lx.TangentSpace().prepared(float), system_of(mechanism, float)
 
     def repeated(system, q, v, count, correct):
         def evaluate(_, carry):

@@ -28,8 +28,8 @@ from benchmarks.peers import PEERS
 from benchmarks.peers.__main__ import rows as peer_rows
 from benchmarks.peers.runs import timed
 from benchmarks.problems import PROBLEMS, TIMES, add_problems, chosen
-from linkax.simulation.files import written_whole
 from linkax.studies.comparison import evaluations
+from linkax.studies.files import written_whole
 
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 SINGLE = 1e-6  # smallest tolerance in single precision
@@ -51,11 +51,9 @@ class Choice(NamedTuple):
 
     def options(self, rtol) -> dict:
         """Of `linkax.simulate`."""
-        accuracy = lx.Accuracy(rtol=rtol, projection=self.projection, metric=self.metric)
-        method = accuracy.method(self.dtype)
-        method = lx.TangentSpace(method.rank_tolerance, metric=self.metric, corrections=self.corrections)
-        given = {} if self.corrections == 1 else {"formulation": method}
-        return {"accuracy": accuracy, "solver": self.solver, "dtype": self.dtype, **given}
+        accuracy = lx.Accuracy(rtol=rtol, projection=self.projection)
+        formulation = lx.TangentSpace(metric=self.metric, corrections=self.corrections)
+        return {"accuracy": accuracy, "formulation": formulation, "solver": self.solver, "dtype": self.dtype}
 
 
 DEFAULT = Choice("", "default")

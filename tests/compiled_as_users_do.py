@@ -9,8 +9,9 @@ from jax import lax
 from known_answers import start
 
 import linkax as lx
-from linkax.compiler import makes_kernels_of_loops
-from linkax.tracing import in_one_kernel, with_products_as_sums
+from linkax.xla.flags import makes_kernels_of_loops
+from linkax.xla.one_kernel import in_one_kernel
+from linkax.xla.products_as_sums import with_products_as_sums
 
 
 def motion(optimise=True):
@@ -21,7 +22,10 @@ def motion(optimise=True):
 
 def kernels():
     """A function of an array and a number that is none, alone, in a batch, and where it makes no sense."""
-    of = lambda sound, array: in_one_kernel(lambda array, count: (array @ array, count), sound, array, 3)
+    square = in_one_kernel(when=lambda *_: True, sound=lambda sound, *_: sound)(
+        lambda _, array, count: (array @ array, count)
+    )
+    of = lambda sound, array: square(sound, array, 3)
     matrices = jnp.arange(32.0).reshape(2, 4, 4)
     alone, count = jax.jit(of)(True, matrices[0])
     batch, _ = jax.jit(jax.vmap(of, in_axes=(None, 0)))(True, matrices)

@@ -9,7 +9,7 @@ os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true --xla_backend_optimization_level=0 "
     "--xla_cpu_parallel_codegen_split_count=1 "
-    # Loops left as they are, see linkax.compiler; tests/test_compiler.py is for what users run.
+    # Loops left as they are, see linkax.xla.flags; tests/test_compiler.py is for what users run.
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024",
 )
 # What one test file has compiled, in this process or another, the next one reads. Errors of Equinox as numbers that are

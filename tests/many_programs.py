@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import linkax as lx
-from linkax.compiler import COMPILING
+from linkax.xla.memory_maps import COMPILING
 
 UNLIKE, REBUILT = 60, 2000
 HELD = 48_000  # memory maps, so that those left are used up several times

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from compiled_as_users_do import motion
 
-from linkax import compiler
-from linkax.compiler import LOOPS, ROOM, makes_kernels_of_loops, quickest_to_compile, set_flags
-from linkax.tracing import runs_once
+from linkax.xla import flags
+from linkax.xla.flags import LOOPS, makes_kernels_of_loops, quickest_to_compile, set_flags
+from linkax.xla.memory_maps import ROOM
+from linkax.xla.tracing import quick_compile
 
 
 def _as_users_do(name):
@@ -72,8 +73,8 @@ def test_the_loop_over_steps_is_one_kernel(as_users_do):
 def test_slow_loops_are_told_once_unless_asked_for(monkeypatch):
     """Flags that come too late, as XLA has read those of the tests."""
     makes_kernels_of_loops.__wrapped__()
-    for flags in ("", LOOPS, "--xla_backend_extra_options=something"):
-        monkeypatch.setenv("XLA_FLAGS", flags)
+    for given in ("", LOOPS, "--xla_backend_extra_options=something"):
+        monkeypatch.setenv("XLA_FLAGS", given)
         with pytest.warns(RuntimeWarning, match=r"jaxlib .* no kernels of loops; import linkax before"):
             makes_kernels_of_loops.__wrapped__()
 
@@ -81,7 +82,7 @@ def test_slow_loops_are_told_once_unless_asked_for(monkeypatch):
 def test_options_that_a_version_does_not_know_are_left_out(monkeypatch):
     known = quickest_to_compile()
     assert known
-    monkeypatch.setattr(compiler, "QUICK", known | {"xla_cpu_no_such_option": True})
+    monkeypatch.setattr(flags, "QUICK", known | {"xla_cpu_no_such_option": True})
     assert quickest_to_compile.__wrapped__() == known
 
 
@@ -93,7 +94,7 @@ def test_flags_that_are_given_stay(monkeypatch):
 
 
 def test_what_runs_once_has_no_part_in_transformations_of_others():
-    @runs_once
+    @quick_compile
     def double(x):
         return 2.0 * x
 
@@ -111,15 +112,15 @@ def test_what_runs_once_has_no_part_in_transformations_of_others():
 def _with_limit(monkeypatch, folder, *free):
     """As if the process had so many memory maps left, one after another; the last one stays."""
     left = iter([*free[:-1], *[free[-1]] * 100])
-    monkeypatch.setattr(compiler, "_maps", lambda: compiler._limit_of_maps() - next(left))
-    monkeypatch.setattr(compiler, "LIMIT_OF_MAPS", folder / "limit")
+    monkeypatch.setattr(flags, "_maps", lambda: flags._limit_of_maps() - next(left))
+    monkeypatch.setattr(flags, "LIMIT_OF_MAPS", folder / "limit")
     (folder / "limit").write_text("70000\n")
 
 
 def test_programs_are_forgotten_where_memory_maps_run_out(monkeypatch, tmp_path):
     """In the middle of what is traced and compiled, which goes on."""
 
-    @runs_once
+    @quick_compile
     def double(x):
         return jnp.sin(2.0 * x)
 
@@ -136,7 +137,7 @@ def test_programs_are_forgotten_where_memory_maps_run_out(monkeypatch, tmp_path)
 
     assert kept(1.0) == kept(1.0) == 2.0
     assert len(traces) == 1
-    assert compiler._limit_of_maps() - compiler._maps() > ROOM
+    assert flags._limit_of_maps() - flags._maps() > ROOM
     _with_limit(monkeypatch, tmp_path, *[ROOM - 1, ROOM] * 2, 70_000)
     with pytest.warns(RuntimeWarning, match=r"nearly all of the 70000 memory maps .* vm\.max_map_count=280000") as told:
         found = both(0.5)
@@ -156,7 +157,7 @@ def test_no_program_is_compiled_where_memory_maps_are_held(monkeypatch, tmp_path
 def test_systems_that_tell_no_limit_are_left_alone(monkeypatch, tmp_path):
     for missing in ("MAPS", "LIMIT_OF_MAPS"):
         with monkeypatch.context() as patch:
-            patch.setattr(compiler, missing, tmp_path / "none")
+            patch.setattr(flags, missing, tmp_path / "none")
             assert jax.jit(lambda x: x + 1.0)(1.0) == 2.0
 
 

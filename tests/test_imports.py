@@ -8,13 +8,16 @@ import pytest
 import linkax
 
 SOURCE = Path(linkax.__file__).parent
-LAYERS = ["compiler", "tracing", "spatial", "linalg", "model", "equations", "formulations", "simulation", "analysis"]
-LAYERS += ["studies", "scenes", "plotting", "cli"]
+CONTRIBUTING = Path(__file__).parents[1] / "CONTRIBUTING.md"
+# From the lowest to the highest, as CONTRIBUTING says: rooms of a layer as layer.room.
+LAYERS = ["xla", "spatial", "model", "linalg", "equations", "formulations"]
+LAYERS += [f"simulation.{room}" for room in ("start", "integrate", "explain", "read", "simulate")]
+LAYERS += ["analysis", "studies", "scenes", "plotting", "cli"]
 
 
 def layer(module):
-    parts = module.split(".")
-    return LAYERS.index(parts[1]) if len(parts) > 1 else None
+    _, *parts = module.split(".")
+    return next(i for i in range(len(LAYERS)) if LAYERS[i] in (parts[0], ".".join(parts[:2])))
 
 
 def imports(path):
@@ -28,7 +31,13 @@ def imports(path):
 @pytest.mark.parametrize("path", sorted(SOURCE.rglob("*.py")), ids=lambda path: str(path.relative_to(SOURCE)))
 def test_imports_run_one_way(path):
     module = "linkax." + ".".join(path.relative_to(SOURCE).with_suffix("").parts)
-    if module == "linkax.__init__":
+    if module in ("linkax.__init__", "linkax.simulation.__init__"):
         return
     for imported in imports(path):
         assert layer(imported) <= layer(module), f"{module} imports {imported}, which is above it"
+
+
+def test_contributing_names_the_layers_in_order():
+    text = CONTRIBUTING.read_text()
+    places = [text.index(f"`{name}`") for name in LAYERS]
+    assert places == sorted(places)

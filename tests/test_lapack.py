@@ -13,7 +13,7 @@ from mechanisms import crank_slider
 import linkax as lx
 from linkax.equations.system import system_of
 from linkax.formulations.named import COMPARED, TANGENT_SPACE, formulation
-from linkax.simulation.passages import between_states
+from linkax.simulation.read.passages import between_states
 
 COUNT = 3
 
@@ -54,7 +54,7 @@ def test_passages(large):
     mechanism, state = large
     pairs = (jnp.tile(part, (COUNT, 2, 1)) for part in (state.q, state.v))
     ts, places = jnp.tile(jnp.array([0.0, 1.0]), (COUNT, 1)), jnp.ones(COUNT)
-    assert not batched_calls(between_states, mechanism, lx.PRECISE, None, ts, *pairs, places)
+    assert not batched_calls(between_states, mechanism, lx.TangentSpace(), None, ts, *pairs, places)
 
 
 READINGS = {
@@ -68,11 +68,11 @@ def test_readings(large, name):
     assert not batched_calls(READINGS[name], times(*large, 41))
 
 
-IDENTITY = lx.Accuracy(metric="identity")
+IDENTITY = lx.TangentSpace(metric="identity")
 MEMBERS = {
     "assemble": lambda mechanism, state: lx.assemble(mechanism),
     "simulate": lambda mechanism, state: lx.simulate(mechanism, state, t1=1.0),
-    "identity metric": lambda mechanism, state: lx.simulate(mechanism, state, t1=1.0, accuracy=IDENTITY),
+    "identity metric": lambda mechanism, state: lx.simulate(mechanism, state, t1=1.0, formulation=IDENTITY),
 }
 SLOW = pytest.param("identity metric", marks=pytest.mark.slow)
 

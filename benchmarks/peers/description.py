@@ -154,7 +154,7 @@ def _check(mechanism):
     for force in mechanism.forces:
         idle = isinstance(force, lx.JointTorque) and not callable(force.torque) and force.torque == 0.0
         if not idle and not isinstance(force, lx.Gravity):
-            raise ValueError(f"{force.described}: peers get Gravity only")
+            raise ValueError(f"{force.display_name}: peers get Gravity only")
     for body in mechanism.bodies:
         if body.mass <= 0.0:
             raise ValueError(f"body {body.name!r} has no mass; peers need some")

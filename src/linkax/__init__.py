@@ -3,12 +3,13 @@
 Importing linkax switches JAX to double precision (`jax_enable_x64`): loops cannot be closed to
 rounding, nor singular configurations passed, in single precision. `simulate(dtype=jnp.float32)`
 computes in single precision all the same. It also adds to `XLA_FLAGS` what lets small mechanisms run fast on a CPU,
-see `linkax.compiler`; import linkax before JAX makes its first array.
+see `linkax.xla.flags`; import linkax before JAX makes its first array.
 """
 
 import jax
 
-from linkax.compiler import set_flags, watch_memory_maps
+from linkax.xla.flags import set_flags
+from linkax.xla.memory_maps import watch_memory_maps
 
 jax.config.update("jax_enable_x64", True)
 set_flags()
@@ -75,25 +76,25 @@ from linkax.model.sections import Section as Section  # noqa: E402
 from linkax.model.sections import circle as circle  # noqa: E402
 from linkax.model.sections import rectangle as rectangle  # noqa: E402
 from linkax.model.terms import Term as Term  # noqa: E402
-from linkax.simulation.accuracy import BALANCED as BALANCED  # noqa: E402
-from linkax.simulation.accuracy import DRAFT as DRAFT  # noqa: E402
-from linkax.simulation.accuracy import PRECISE as PRECISE  # noqa: E402
-from linkax.simulation.accuracy import Accuracy as Accuracy  # noqa: E402
-from linkax.simulation.assembly import AssemblyError as AssemblyError  # noqa: E402
-from linkax.simulation.assembly import AssemblyWarning as AssemblyWarning  # noqa: E402
-from linkax.simulation.assembly import assemble as assemble  # noqa: E402
-from linkax.simulation.instant import Pose as Pose  # noqa: E402
-from linkax.simulation.instant import Power as Power  # noqa: E402
-from linkax.simulation.instant import Violation as Violation  # noqa: E402
-from linkax.simulation.results import REMARKS as REMARKS  # noqa: E402
-from linkax.simulation.results import RESULTS as RESULTS  # noqa: E402
-from linkax.simulation.results import AccuracyWarning as AccuracyWarning  # noqa: E402
-from linkax.simulation.results import SimulationError as SimulationError  # noqa: E402
-from linkax.simulation.results import StiffnessWarning as StiffnessWarning  # noqa: E402
-from linkax.simulation.runge_kutta import RungeKutta4 as RungeKutta4  # noqa: E402
+from linkax.simulation.integrate.accuracy import BALANCED as BALANCED  # noqa: E402
+from linkax.simulation.integrate.accuracy import DRAFT as DRAFT  # noqa: E402
+from linkax.simulation.integrate.accuracy import PRECISE as PRECISE  # noqa: E402
+from linkax.simulation.integrate.accuracy import Accuracy as Accuracy  # noqa: E402
+from linkax.simulation.integrate.results import REMARKS as REMARKS  # noqa: E402
+from linkax.simulation.integrate.results import RESULTS as RESULTS  # noqa: E402
+from linkax.simulation.integrate.results import AccuracyWarning as AccuracyWarning  # noqa: E402
+from linkax.simulation.integrate.results import SimulationError as SimulationError  # noqa: E402
+from linkax.simulation.integrate.results import StiffnessWarning as StiffnessWarning  # noqa: E402
+from linkax.simulation.integrate.runge_kutta import RungeKutta4 as RungeKutta4  # noqa: E402
+from linkax.simulation.read.observables import Pose as Pose  # noqa: E402
+from linkax.simulation.read.observables import Power as Power  # noqa: E402
+from linkax.simulation.read.observables import Violation as Violation  # noqa: E402
+from linkax.simulation.read.solution import Solution as Solution  # noqa: E402
 from linkax.simulation.simulate import simulate as simulate  # noqa: E402
-from linkax.simulation.solution import Solution as Solution  # noqa: E402
-from linkax.simulation.state import State as State  # noqa: E402
+from linkax.simulation.start.assembly import AssemblyError as AssemblyError  # noqa: E402
+from linkax.simulation.start.assembly import AssemblyWarning as AssemblyWarning  # noqa: E402
+from linkax.simulation.start.assembly import assemble as assemble  # noqa: E402
+from linkax.simulation.start.state import State as State  # noqa: E402
 from linkax.studies.comparison import Comparison as Comparison  # noqa: E402
 from linkax.studies.comparison import Stepping as Stepping  # noqa: E402
 from linkax.studies.comparison import Trial as Trial  # noqa: E402

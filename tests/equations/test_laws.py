@@ -17,7 +17,7 @@ from mechanisms import POOL, crank_slider, with_cut
 
 import linkax as lx
 from linkax.equations import dynamics, loops
-from linkax.equations.configuration import bodies_of_cuts, by_speed_of, configure
+from linkax.equations.configuration import bodies_of_cuts, configure, sum_by_speed
 from linkax.equations.coordinates import neutral, on_manifold, rates, retract
 from linkax.equations.motion import move
 from linkax.equations.reactions import cut_reactions, reactions, seen_from
@@ -111,7 +111,7 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     body = topology.moved_body
     sign = jnp.where(topology.reversed[body], -1.0, 1.0)[:, None]
     left = jnp.sum(sign * (every.force[body] * configuration.sliding + every.moment[body] * configuration.angular), -1)
-    left = by_speed_of(topology, left)
+    left = sum_by_speed(topology, left)
     # Of a joint that bends the reaction has the joint's own forces in it.
     bends = np.array([topology.joint_types[body].motion is not None for body, _ in topology.motions])
     own = np.isin(np.arange(topology.num_speeds), topology.motions[bends, 1])

@@ -10,9 +10,9 @@ from known_answers import crank_slider, turning
 
 import linkax as lx
 from linkax.scenes import SCENES
-from linkax.simulation.diagnosis import cause
-from linkax.simulation.remarks import in_words
-from linkax.simulation.results import RESULTS
+from linkax.simulation.explain.diagnosis import cause
+from linkax.simulation.explain.remarks import in_words
+from linkax.simulation.integrate.results import RESULTS
 
 PLAIN = {"crank": 1.0, "rod": 3.0, "crank_mass": 1.0, "rod_mass": 1.0, "slider_mass": 1.0}
 PLAIN |= {"gravity": 9.81, "torque": 0.0, "angle": 0.3, "speed": 2.0}

@@ -9,8 +9,8 @@ from known_answers import reference, start
 
 import linkax as lx
 from linkax.formulations.named import BASES, formulation
-from linkax.formulations.shared_program import in_shared_programs
-from linkax.simulation.runge_kutta import RungeKutta4
+from linkax.formulations.switch import in_one_program
+from linkax.simulation.integrate.runge_kutta import RungeKutta4
 
 FIXED = {"solver": RungeKutta4(), "stepsize_controller": diffrax.ConstantStepSize()}
 NAMES = [
@@ -33,7 +33,7 @@ def _with_low_penalty(chosen):
     return chosen
 
 
-SHARED = dict(zip(NAMES, in_shared_programs([_with_low_penalty(formulation(name)) for name in NAMES]), strict=True))
+SHARED = dict(zip(NAMES, in_one_program([_with_low_penalty(formulation(name)) for name in NAMES]), strict=True))
 COUNTS = {"crank-slider": (1000, 1600, 2400), "pendulum": (80, 160, 320)}
 
 

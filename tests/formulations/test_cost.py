@@ -8,6 +8,7 @@ import pytest
 import linkax as lx
 from linkax.equations import configuration, coordinates, loops
 from linkax.equations.coordinates import neutral
+from linkax.equations.structure import structure_of
 from linkax.equations.system import system_of
 from linkax.model import ropes
 
@@ -33,7 +34,7 @@ def four_bar(closing):
 
 def compiled(mechanism):
     """The right-hand side, and how many operations it has."""
-    method = lx.BALANCED.method(float, jnp.array([mechanism.topology.num_rows]))
+    method = lx.TangentSpace().prepared(float, jnp.array([mechanism.topology.num_rows]))
 
     @jax.jit
     def acceleration(q, v):
@@ -55,7 +56,7 @@ def test_spatial_joints_in_a_plane_cost_what_rows_picked_by_hand_cost():
 
 
 def traced(mechanism):
-    method, system = lx.BALANCED.method(float), system_of(mechanism, float)
+    method, system = lx.TangentSpace().prepared(float), system_of(mechanism, float)
     q, v = neutral(mechanism.topology, float), jnp.zeros(mechanism.topology.num_speeds)
 
     def step(t, q, v):
@@ -103,7 +104,7 @@ def test_mechanisms_that_share_only_ground_are_islands():
         ]
 
     (bodies, joints), (more_bodies, more_joints) = slider_crank(0), slider_crank(1)
-    sizes = lambda mechanism: [(len(rows), len(columns)) for rows, columns in mechanism.topology.islands]
+    sizes = lambda mechanism: [(len(rows), len(columns)) for rows, columns in structure_of(mechanism.topology).islands]
     gears = lx.Coupling("gears", {"bearing0": 1.0, "bearing1": 1.0})
     assert sizes(lx.Mechanism(bodies + more_bodies, joints + more_joints)) == [(2, 3), (2, 3)]
     assert sizes(lx.Mechanism(bodies + more_bodies, joints + more_joints, constraints=[gears])) == [(5, 6)]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linkax.formulations.passage import NEAR, Course, Value, limit
+from linkax.formulations.singular_limit import NEAR, Direction, Value, singular_limit
 
 UNITS = jnp.ones(2)
 
@@ -46,8 +46,8 @@ V = jnp.array([2.0, 1.0])
 
 
 def answer(function, noise, q):
-    course = Course(jnp.zeros(()), q, V, UNITS, jnp.add, advances=False)
-    return limit(function, (0, 1), noise, course)[0][1]
+    course = Direction(jnp.zeros(()), q, V, UNITS, jnp.add, advances=False)
+    return singular_limit(function, (0, 1), noise, course)[0][1]
 
 
 def test_noise_is_left_out():

@@ -10,13 +10,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from linkax.linalg.constrained_solve import (
-    constrained_solve,
-    invert,
-    invert_apart,
-    least_multipliers,
-    with_mass,
-)
+from linkax.linalg.constrained_solve import constrained_solve, invert, invert_apart, least_multipliers, with_mass
 
 TOLERANCE = 1e-10
 METRICS = ["mass", "identity"]
@@ -80,16 +74,16 @@ def matrices(given_problem, theta):
     return mass, jacobian, p.force * (1.0 + theta[0] * theta[1]), jacobian @ (p.rate + theta[0] * p.force)
 
 
-def inverted(metric, mass, jacobian, units):
+def inverted(metric, mass, jacobian, scales):
     if metric == "mass":
-        return invert(mass, jacobian, units, TOLERANCE)
-    return with_mass(invert(None, jacobian, units, TOLERANCE), mass)
+        return invert(mass, jacobian, scales, TOLERANCE)
+    return with_mass(invert(None, jacobian, scales, TOLERANCE), mass)
 
 
-def solved(metric, given_problem, units, theta):
+def solved(metric, given_problem, scales, theta):
     """What is unique: a and the constraint force Jᵀλ; and λ."""
     mass, jacobian, f, gamma = matrices(given_problem, theta)
-    a, multipliers = constrained_solve(inverted(metric, mass, jacobian, units), mass, jacobian, f, gamma)
+    a, multipliers = constrained_solve(inverted(metric, mass, jacobian, scales), mass, jacobian, f, gamma)
     return jnp.concatenate([a, jacobian.T @ multipliers]), multipliers
 
 
@@ -103,9 +97,9 @@ THETA = np.array([0.1, -0.2])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_it_solves_the_saddle_point_system(case, metric, seed):
     chosen = problem(case, seed)
-    units = UNITS[chosen.masses.size]
+    scales = UNITS[chosen.masses.size]
     mass, jacobian, f, gamma = map(np.asarray, matrices(chosen, THETA))
-    unique, multipliers = map(np.asarray, answers(metric, chosen, units, THETA))
+    unique, multipliers = map(np.asarray, answers(metric, chosen, scales, THETA))
     n, m = mass.shape[0], len(jacobian)
     saddle = np.block([[mass, -jacobian.T], [jacobian, np.zeros((m, m))]])
     expected = np.linalg.lstsq(saddle, np.concatenate([f, gamma]), rcond=1e-10)[0]
@@ -123,7 +117,7 @@ def test_it_solves_the_saddle_point_system(case, metric, seed):
 def test_the_answer_depends_on_neither_metric_nor_units(case):
     chosen = problem(case)
     n = chosen.masses.size
-    found = [answers(metric, chosen, units[n], THETA)[0] for metric in METRICS for units in (UNITS, ONES)]
+    found = [answers(metric, chosen, scales[n], THETA)[0] for metric in METRICS for scales in (UNITS, ONES)]
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], atol=1e-12 * np.max(np.abs(found[0])))
 
@@ -181,8 +175,8 @@ def test_without_independent_rows_nothing_is_constrained():
         np.testing.assert_array_equal(multipliers, np.zeros(rows))
 
 
-def compositions(metric, given_problem, units, theta):
-    function = lambda theta: solved(metric, given_problem, units, theta)[0]
+def compositions(metric, given_problem, scales, theta):
+    function = lambda theta: solved(metric, given_problem, scales, theta)[0]
     return {
         "value": function(theta),
         "forward": jax.jacfwd(function)(theta),
@@ -209,8 +203,8 @@ def central(values):
 @pytest.mark.parametrize("case", RANKS)
 def test_derivatives_to_second_order_in_all_modes(case, metric):
     chosen = problem(case)
-    units = UNITS[chosen.masses.size]
-    batch = jax.tree.map(np.asarray, derivatives_of_batch(metric, chosen, units, AROUND))
+    scales = UNITS[chosen.masses.size]
+    batch = jax.tree.map(np.asarray, derivatives_of_batch(metric, chosen, scales, AROUND))
     first, second = central(batch["value"]), central(batch["forward"])
     for mode, found in batch.items():
         expected = {"value": batch["value"][0], "forward": first, "reverse": first}.get(mode, second)

@@ -13,7 +13,6 @@ from refusals import Shown, refused
 
 import linkax as lx
 from linkax.equations.system import system_of
-from linkax.simulation.accuracy import BALANCED
 
 UNSHOWN = ("law", "frames", "coefficients")  # functions and dictionaries have no short name
 
@@ -180,6 +179,6 @@ def test_a_right_mechanism_is_not_refused(plan):
 
     def acceleration(state):
         system = system_of(mechanism, float)
-        return BALANCED.method(system.dtype).derivative(system, jnp.zeros(()), state.q, state.v, True)[1]
+        return lx.TangentSpace().prepared(system.dtype).derivative(system, jnp.zeros(()), state.q, state.v, True)[1]
 
     assert eqx.filter_eval_shape(acceleration, state).shape == (topology.num_speeds,)

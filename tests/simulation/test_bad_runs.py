@@ -15,8 +15,9 @@ from plans import FEW
 from refusals import Shown, refused
 
 import linkax as lx
-from linkax.simulation import assembly, simulate
-from linkax.simulation.given import sound_numbers
+from linkax.simulation import simulate
+from linkax.simulation.start import assembly
+from linkax.simulation.start.validation import sound_numbers
 
 MECHANISM = crank_slider()
 N_Q, N_V = MECHANISM.topology.num_coordinates, MECHANISM.topology.num_speeds

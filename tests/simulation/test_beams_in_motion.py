@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import linkax as lx
-from linkax.simulation.solvers import default_solver
+from linkax.simulation.integrate.default_solver import default_solver
 
 
 def released(damping=0.0):

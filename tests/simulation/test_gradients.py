@@ -18,7 +18,7 @@ from linkax.equations.dynamics import generalised_force
 from linkax.equations.loops import gamma
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
-from linkax.formulations.formulation import coefficients
+from linkax.formulations.formulation import linear_system
 from linkax.scenes import SCENES
 
 SCENE = SCENES["crank-slider"]
@@ -76,7 +76,7 @@ class Case(NamedTuple):
         mechanism = self.start(numbers)[0]
         system = system_of(mechanism, float)
         q, v = jnp.split(y, [mechanism.topology.num_coordinates])
-        configuration, jacobian, mass, _ = coefficients(system, t, q)
+        configuration, jacobian, mass, _ = linear_system(system, t, q)
         motion = move(configuration, v)
         free, reach = (jnp.linalg.solve(mass, right) for right in (generalised_force(motion), jacobian.T))
         multipliers = jnp.linalg.pinv(jacobian @ reach, rtol=1e-9, hermitian=True) @ (gamma(motion) - jacobian @ free)
@@ -123,7 +123,7 @@ def forward_derivatives(scene, numbers):
     return np.asarray(program(scene)[1](numbers, case.t1, jnp.zeros(case.size()))[1])
 
 
-def units(numbers):
+def scales(numbers):
     """Of changes: relative, but for numbers that are zero."""
     return np.where(numbers == 0.0, 1.0, np.abs(numbers))
 
@@ -133,7 +133,7 @@ FACTORS = np.array([1.0, -1.0, 2.0, -2.0])
 
 def central_differences(function, at, step=3e-4):
     """Of fourth order, along all numbers in their units, of a function of several sets of numbers at once."""
-    moves = step * FACTORS[:, None, None] * np.diag(units(at))
+    moves = step * FACTORS[:, None, None] * np.diag(scales(at))
     ends = np.asarray(function(np.concatenate(at + moves))).reshape(*moves.shape[:2], -1)
     return np.tensordot([8.0, -8.0, -1.0, 1.0], ends, 1).T / (12.0 * step)
 
@@ -144,7 +144,7 @@ def test_both_modes_agree_with_central_differences(scene, variant):
     case, (ends, derivatives) = CASES[scene], program(scene)
     at, t1, weights = case.numbers(variant), case.t1, np.random.default_rng(0).normal(size=case.size())
     _, forwards, backwards = (np.asarray(part) for part in derivatives(at, t1, weights))
-    backwards, forwards = backwards * units(at), forwards * units(at)
+    backwards, forwards = backwards * scales(at), forwards * scales(at)
     np.testing.assert_allclose(backwards, weights @ forwards, rtol=1e-9, atol=1e-9 * np.max(np.abs(backwards)))
     off = np.abs(central_differences(lambda numbers: ends(numbers, t1), at) - forwards) / np.max(
         np.abs(forwards), axis=1, keepdims=True
@@ -180,8 +180,8 @@ def test_forwards_agrees_with_integrated_sensitivities(scene, variant):
         return np.asarray(of_all(t, both[:, 0], both[:, 1:])).ravel()
 
     found = solve_ivp(flat, (0.0, case.t1), begins.ravel(), method="DOP853", rtol=1e-10, atol=1e-11)
-    integrated = found.y[:, -1].reshape(begins.shape)[:, 1:] * units(at)
-    forwards = forward_derivatives(scene, at) * units(at)
+    integrated = found.y[:, -1].reshape(begins.shape)[:, 1:] * scales(at)
+    forwards = forward_derivatives(scene, at) * scales(at)
     off = np.abs(integrated - forwards) / np.max(np.abs(forwards), axis=1, keepdims=True)
     assert np.max(off) <= 1e-6
 
@@ -191,8 +191,8 @@ def test_forwards_agrees_with_integrated_sensitivities(scene, variant):
 def test_duplicated_cut_joints_change_no_derivative(scene):
     case = CASES[scene]
     at = case.numbers()
-    duplicated = jax.jit(jax.jacfwd(lambda numbers: case.end(numbers, case.t1, duplicated=True)))(at) * units(at)
-    forwards = forward_derivatives(scene, at) * units(at)
+    duplicated = jax.jit(jax.jacfwd(lambda numbers: case.end(numbers, case.t1, duplicated=True)))(at) * scales(at)
+    forwards = forward_derivatives(scene, at) * scales(at)
     np.testing.assert_allclose(duplicated, forwards, atol=1e-9 * np.max(np.abs(forwards)))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import linkax as lx
-from linkax.compiler import COMPILING
+from linkax.xla.memory_maps import COMPILING
 
 
 @contextmanager

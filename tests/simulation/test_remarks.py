@@ -13,7 +13,7 @@ from known_answers import turning
 import linkax as lx
 from linkax.linalg.spectral_radius import spectral_radius
 from linkax.scenes import SCENES
-from linkax.simulation.results import WARNINGS
+from linkax.simulation.integrate.results import WARNINGS
 
 GRAVITY = lx.Gravity([0.0, -9.81, 0.0])
 

@@ -1,13 +1,14 @@
-"""Rows of loops long enough to be solved cell by cell."""
+"""Rows of loops long enough to be solved front by front."""
 
 import numpy as np
 import pytest
 from known_answers import start
 
 import linkax as lx
+from linkax.equations.structure import structure_of
 from linkax.equations.system import system_of
-from linkax.formulations.formulation import coefficients
-from linkax.linalg.chained_inverse import ChainedInverse
+from linkax.formulations.formulation import linear_system
+from linkax.linalg.block_elimination import BlockInverse
 from linkax.scenes import SCENES
 
 COUNT = 8
@@ -25,14 +26,14 @@ def row():
 
 def test_from_a_singular_configuration_through_others_with_redundant_loops(row):
     mechanism, state = row
-    chain = mechanism.topology.chain
-    assert len(chain.added) >= COUNT
+    plan = structure_of(mechanism.topology).elimination
+    assert len(plan.interior) >= COUNT
     found = lx.simulate(mechanism, state, t1=4.0)
     exact = SCENES["n-four-bar"].exact(SCENES["n-four-bar"].settings("A02", SETTINGS), found.ts)["B0"]
     assert np.max(np.linalg.norm(found.position("link_0", at="tip") - exact, axis=-1)) <= 1e-6
     assert found.closest < 1e-2
-    # Two of each cell's rows; the cell that only prepares the next has none.
-    assert sorted(found.rank_nearby) == [0] * (len(chain.added) - COUNT) + [2] * COUNT
+    # Two of each front's rows; the front that only prepares the next has none.
+    assert sorted(found.rank_nearby) == [0] * (len(plan.interior) - COUNT) + [2] * COUNT
     assert np.max(np.abs(found.violation().position)) <= 1e-14
 
 
@@ -41,10 +42,10 @@ def test_accelerations_and_corrections_are_those_of_all_loops_at_once(row):
     _, upright = start("n-four-bar", "A02", {"N": COUNT, "angle": 1.0})
     system, rng = system_of(mechanism, float), np.random.default_rng(0)
     for metric in ("mass", "identity"):
-        method = lx.Accuracy(metric=metric).method(float)
-        given = coefficients(system, 0.0, upright.q)
+        method = lx.TangentSpace(metric=metric).prepared(float)
+        given = linear_system(system, 0.0, upright.q)
         f, gamma = rng.normal(size=len(upright.v)), given.jacobian @ rng.normal(size=len(upright.v))
-        by_cells = method._solve(method._split(given), given, f, gamma, sweeps=1)[0]
-        at_once = method._solve(method._split_at_once(given), given, f, gamma, sweeps=1)[0]
-        np.testing.assert_allclose(by_cells, at_once, atol=1e-11)
-        assert isinstance(method._split(given), ChainedInverse)
+        by_fronts = method.solve_accelerations(given, method.split(given), f, gamma, 1)[0]
+        at_once = method.solve_accelerations(given, method._split_at_once(given), f, gamma, 1)[0]
+        np.testing.assert_allclose(by_fronts, at_once, atol=1e-11)
+        assert isinstance(method.split(given), BlockInverse)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import linkax as lx
+from linkax.cli import progress_run
 from linkax.scenes import SCENES
-from linkax.simulation import segments, solution
-from linkax.simulation.instant import Instant
+from linkax.simulation.read import solution
+from linkax.simulation.read.observables import Observables
 
 
 def pendulum(length=1.0, forces=()):
@@ -59,12 +60,12 @@ def test_poses_are_those_of_each_body():
 
 @pytest.mark.parametrize(("worth", "optimised"), [(np.inf, False), (0.0, True)])
 def test_a_run_in_segments_is_the_run(monkeypatch, worth, optimised):
-    monkeypatch.setattr(segments, "LONG_RUN", 0.0)
-    monkeypatch.setattr(segments, "WORTH_OPTIMISING", worth)
+    monkeypatch.setattr(progress_run, "LONG_RUN", 0.0)
+    monkeypatch.setattr(progress_run, "WORTH_OPTIMISING", worth)
     told, kept, mechanism = [], [], pendulum()
     state = lx.assemble(mechanism, {"pivot": 0.3})
     options = {"t1": 2.0, "accuracy": lx.PRECISE}
-    found = segments.simulate_in_segments(
+    found = progress_run.simulate_in_segments(
         mechanism, state, **options, report=lambda *now: told.append(now), keep=kept.append
     )
     assert found.optimised == optimised
@@ -99,9 +100,9 @@ def test_a_reading_is_computed_once(monkeypatch):
     monkeypatch.setattr(solution, "_of_times", watched)
     first, again = found.reaction("pivot"), found.reaction("pivot")
     np.testing.assert_array_equal(first.force, again.force)
-    assert computed == [Instant.solve, Instant.reactions]
+    assert computed == [Observables.solve, Observables.reactions]
     found.violation()
-    assert computed[2:] == [Instant.violation_and_scales]
+    assert computed[2:] == [Observables.violation_and_scales]
     of_all, each = solution._of_solutions, id(found)
     assert each in of_all
     del found

@@ -11,14 +11,17 @@ import optimistix as optx
 import pytest
 
 import linkax as lx
-from linkax.simulation.integration import Chord, MechanismControl, StepError, placements
+from linkax.simulation.integrate.diffrax_contract import StepError
+from linkax.simulation.integrate.projected_solver import Chord, retry_factors
+from linkax.simulation.integrate.step_control import MechanismControl
 
+SCALES = jnp.array([1.0, 1e3])
 ARGS = SimpleNamespace(
-    system=SimpleNamespace(units=jnp.array([1.0, 1e3])),
+    system=SimpleNamespace(scales=SCALES, fastest=lambda v: jnp.max(jnp.abs(v / SCALES))),
     accuracy=lx.Accuracy(rtol=1e-8),
-    method=lx.Accuracy().method(np.float64),
+    method=lx.TangentSpace().prepared(float),
     unpacked=lambda y: (y[:2], y[2:4]),
-    sound=True,
+    can_start=True,
 )
 Y = jnp.array([1.0, 2e3, 3.0, 4e3, 0.0])
 FAR = StepError((jnp.zeros(2), jnp.zeros(2)), jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(0.5))
@@ -136,7 +139,7 @@ def test_under_jit_vmap_and_both_modes():
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Kvaerno5()])
 def test_an_event_at_any_node_is_moved_between_nodes(solver):
     nodes = np.asarray(solver.tableau.c, dtype=float)
-    for node, factor in zip(nodes, placements(nodes), strict=True):
+    for node, factor in zip(nodes, retry_factors(nodes), strict=True):
         assert 0.0 < factor <= 1.0
         gaps = np.abs(np.array([0.0, *nodes]) - node / factor)
         assert np.min(gaps) >= 0.02, (node, factor)

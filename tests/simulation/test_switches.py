@@ -80,11 +80,11 @@ def test_ropes_that_go_taut_and_slack(rtol):
     ends, forwards, backwards = map(np.asarray, bungees(BUNGEES, rtol))
     for numbers, end, forward, backward in zip(BUNGEES, ends, forwards, backwards, strict=True):
         exact, slopes = bungee_exact(numbers), bungee_slopes(numbers)
-        units = np.maximum(numbers, 0.5)  # of changes
-        size = np.max(np.abs(slopes * units))
+        scales = np.maximum(numbers, 0.5)  # of changes
+        size = np.max(np.abs(slopes * scales))
         assert np.max(np.abs(end - exact)) <= 30.0 * rtol * np.max(np.abs(exact))
-        assert np.max(np.abs(forward - slopes) * units) <= max(100.0 * rtol, 1e-9) * size
-        np.testing.assert_allclose(backward * units, forward * units, rtol=1e-9, atol=1e-11 * size)
+        assert np.max(np.abs(forward - slopes) * scales) <= max(100.0 * rtol, 1e-9) * size
+        np.testing.assert_allclose(backward * scales, forward * scales, rtol=1e-9, atol=1e-11 * size)
 
 
 @pytest.mark.slow

@@ -27,13 +27,15 @@ from linkax.equations.coordinates import retract
 from linkax.equations.dynamics import generalised_force
 from linkax.equations.loops import is_driven
 from linkax.equations.motion import move
+from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.model.mechanism import Mechanism
-from linkax.simulation.accuracy import Accuracy
-from linkax.simulation.closing import CLOSED, LONGEST_STEP
-from linkax.simulation.given import checked_state, checked_time, marked
-from linkax.simulation.state import State
-from linkax.tracing import all_known, one_by_one, pushed_forward, runs_once
+from linkax.simulation.start.closing import CLOSED, LONGEST_STEP
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.xla.batches import one_by_one
+from linkax.xla.derivatives import pushforward
+from linkax.xla.tracing import all_concrete, evaluate_now, quick_compile
 
 MOST_STEPS = 200
 AT_REST = 1e-12  # step [rad, lengths of the mechanism] below which the search for an equilibrium ends
@@ -45,7 +47,7 @@ ASIDE = 1e-3  # first step out of an unstable equilibrium [rad, lengths of the m
 _pseudo_inverse = one_by_one(lambda matrix: jnp.linalg.pinv(matrix, rtol=NEUTRAL))
 
 # Equilibria need no mass, and forces differ less between soft and stiff directions than accelerations do.
-_STATICS = Accuracy(metric="identity")
+_STATICS = TangentSpace(metric="identity")
 
 
 class EquilibriumError(RuntimeError):
@@ -65,27 +67,27 @@ class _Balanced(Nearby):
 
     @staticmethod
     def of(system, method, t, q) -> "_Balanced":
-        basis = lax.stop_gradient(method.crossing(system, t, q).inverse.basis)
-        return _Balanced(system, method, t, q, basis, basis.T / system.units**2)
+        basis = lax.stop_gradient(method.constraint_split(system, t, q).inverse.basis)
+        return _Balanced(system, method, t, q, basis, basis.T / system.scales**2)
 
     def motion(self, y):
         """How the mechanism moves at y: as drives ask, and else as little as the loops allow. And its loops there."""
-        rest = jnp.zeros_like(self.system.units)
+        rest = jnp.zeros_like(self.system.scales)
         q, v, *_ = self.method.correct(self.system, self.t, self.at(y), rest)
-        crossing = self.method.crossing(self.system, self.t, q)
+        crossing = self.method.constraint_split(self.system, self.t, q)
         return move(crossing.configuration, v if is_driven(self.system) else rest), crossing
 
     def force(self, y):
         """What the forces do along y, less what the loops take."""
         motion, crossing = self.motion(y)
         forces, none = generalised_force(motion), jnp.zeros(len(crossing.jacobian), y.dtype)
-        metric = jnp.diag(self.system.units**-2)
+        metric = jnp.diag(self.system.scales**-2)
         left, _ = constrained_solve(crossing.inverse, metric, crossing.jacobian, forces, none)
         return self.dual @ left
 
     def at_rest(self):
         """The force at y = 0, and the stiffness, minus its derivative."""
-        force, slopes = self.slopes(self.force, jnp.zeros_like(self.system.units))
+        force, slopes = self.slopes(self.force, jnp.zeros_like(self.system.scales))
         return force, -slopes
 
 
@@ -136,9 +138,8 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
     found, ending = _equilibrium(mechanism, state, t, moves)
     if not moves:
         # Known inside of transformations too, so that what reads the state need not reckon with motion.
-        with jax.core.eval_context():
-            found = State(found.q, jnp.zeros(found.v.shape, found.v.dtype))
-    if not all_known((found, ending)):
+        found = State(found.q, evaluate_now(jnp.zeros, found.v.shape, found.v.dtype))
+    if not all_concrete((found, ending)):
         return State(marked(mechanism, jnp.where(ending.is_sound, found.q, jnp.nan)), found.v)
     _check_steady(mechanism, ending, found, t)
     if not ending.gap <= CLOSED:
@@ -171,7 +172,7 @@ def _check_steady(mechanism, ending, found, t):
         told = of_missed_rate(mechanism, missed, int(np.argmax(misses)), t)
         raise EquilibriumError(f"{told}, or {still}", found)
     if ending.longest <= BALANCED_STEP and not ending.changes <= AGREES:
-        driven = [constraint.described for constraint in mechanism.constraints if constraint.is_driven]
+        driven = [constraint.display_name for constraint in mechanism.constraints if constraint.is_driven]
         raise EquilibriumError(
             f"no equilibrium lasts while {' and '.join(driven)} goes on: forces or loops change by "
             f"{float(ending.changes):.3g} of the largest; {still}, or drive at a constant rate what changes neither",
@@ -179,11 +180,11 @@ def _check_steady(mechanism, ending, found, t):
         )
 
 
-@runs_once
+@quick_compile
 def _equilibrium(mechanism, state, t, moves):
     system = system_in(mechanism, state, t, moves)
     q, search = _at_rest(system, t, lax.stop_gradient(state.q))
-    v, method = jnp.zeros(system.topology.num_speeds, system.dtype), _STATICS.method(system.dtype)
+    v, method = jnp.zeros(system.topology.num_speeds, system.dtype), _STATICS.prepared(system.dtype)
     missed, changes = jnp.zeros(len(system.constraints), system.dtype), jnp.zeros((), system.dtype)
     gap = jnp.where(jnp.all(jnp.isfinite(state.v)), widest_gap(system, t, q), jnp.inf)
     if moves:
@@ -230,8 +231,8 @@ class _Search(NamedTuple):
 @eqx.filter_custom_jvp
 def _at_rest(system, t, q):
     """Coordinates of an equilibrium, by a search from q; and how it ended."""
-    method, rest = _STATICS.method(system.dtype), jnp.zeros(system.topology.num_speeds, system.dtype)
-    size = lambda step: jnp.max(jnp.abs(step / system.units), initial=0.0)
+    method, rest = _STATICS.prepared(system.dtype), jnp.zeros(system.topology.num_speeds, system.dtype)
+    size = system.fastest
 
     def unfinished(search):
         return (search.count < MOST_STEPS) & (search.longest > AT_REST)
@@ -255,7 +256,7 @@ def _at_rest(system, t, q):
         circulation = jnp.max(jnp.abs(stiffness - stiffness.T)) / 2.0
         aside = here.basis @ vectors[:, 0]
         # The sign of an eigenvector is chance.
-        aside = aside * jnp.sign(aside[jnp.argmax(jnp.abs(aside / system.units))])
+        aside = aside * jnp.sign(aside[jnp.argmax(jnp.abs(aside / system.scales))])
         leave = (size(step) <= AT_REST) & (lowest < 0.0) & (circulation <= -lowest)
         step, work = jnp.where(leave, ASIDE * aside / size(aside), shorter * step), shorter * (downhill @ force)
         onwards = _Search(search.count + 1, q, step, size(step), jnp.where(leave, 0.0, work), lowest, circulation)
@@ -276,14 +277,14 @@ def _at_rest_jvp(primals, changes):
     """Where the forces stay in balance, to any order: the search has no derivative."""
     (system, t, begin), (system_change, t_change, _) = primals, changes
     q, search = _at_rest(system, t, begin)
-    here = _Balanced.of(system, _STATICS.method(system.dtype), t, q)
+    here = _Balanced.of(system, _STATICS.prepared(system.dtype), t, q)
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
     force = lambda system, t: dataclasses.replace(here, system=system, t=t).force(rest)
-    _, unbalanced = pushed_forward(force, (system, t), (system_change, t_change))
+    _, unbalanced = pushforward(force, (system, t), (system_change, t_change))
     change = _pseudo_inverse(here.at_rest()[1]) @ unbalanced
 
     def moved(system, t, y):
         return here.method.close(system, t, retract(system.topology, q, here.basis @ y), rest)[0]
 
-    _, q_change = pushed_forward(moved, (system, t, rest), (system_change, t_change, change))
+    _, q_change = pushforward(moved, (system, t, rest), (system_change, t_change, change))
     return (q, search), (q_change, jax.tree.map(lambda _: None, search))

@@ -13,14 +13,13 @@ from linkax.equations.dynamics import generalised_force, mass_matrix
 from linkax.equations.loops import gamma, jacobian
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
+from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve, invert, least_multipliers
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known
-from linkax.simulation.accuracy import BALANCED
-from linkax.simulation.diagnosis import massless_bodies
-from linkax.simulation.given import by_joint, checked_state, checked_time, marked
-from linkax.simulation.state import State
-from linkax.tracing import runs_once
+from linkax.simulation.explain.diagnosis import massless_bodies
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import by_joint, checked_state, checked_time, marked
+from linkax.xla.tracing import concrete, quick_compile
 
 MET = 1e-9  # relative to the largest acceleration
 
@@ -52,10 +51,10 @@ def inverse_dynamics(mechanism: Mechanism, state: State, accelerations, *, t=0.0
     if not wanted.terms:
         raise ValueError("inverse_dynamics needs accelerations; give {joint: acceleration, ...}")
     acceleration, forces, misses = _inverse_dynamics(mechanism, state, wanted, t)
-    if known(acceleration) is not None:
+    if concrete(acceleration) is not None:
         if not np.all(np.isfinite(acceleration)):
             system = system_of(mechanism, state.q.dtype)
-            massless = massless_bodies(system, BALANCED.method(system.dtype), t, state.q)
+            massless = massless_bodies(system, TangentSpace().prepared(system.dtype), t, state.q)
             raise ValueError(
                 "accelerations are not finite; give mass and inertia to bodies that move without, "
                 f"{', '.join(map(repr, massless)) or 'none here'}, and finite numbers to forces"
@@ -71,7 +70,7 @@ def inverse_dynamics(mechanism: Mechanism, state: State, accelerations, *, t=0.0
     return marked(mechanism, InverseDynamics(dict(zip(accelerations, forces, strict=True)), acceleration))
 
 
-@runs_once
+@quick_compile
 def _inverse_dynamics(mechanism, state, wanted, t):
     system, (q, v) = system_of(mechanism, state.q.dtype), (state.q, state.v)
     configuration = configure(system, t, q)
@@ -84,10 +83,10 @@ def _inverse_dynamics(mechanism, state, wanted, t):
     along = jax.jacfwd(lambda v: speeds(q, v))(v)
     rows = jnp.concatenate([loops, along])
     right = jnp.concatenate([gamma(motion), jnp.concatenate(wanted.values) - turning])
-    tolerance = BALANCED.method(system.dtype).rank_tolerance
-    inverse = invert(mass, rows, system.units, tolerance)
+    tolerance = TangentSpace().prepared(system.dtype).rank_tolerance
+    inverse = invert(mass, rows, system.scales, tolerance)
     acceleration, multipliers = constrained_solve(inverse, mass, rows, generalised_force(motion), right)
-    multipliers = least_multipliers(rows, multipliers, system.units, tolerance, inverse.rank).multipliers
+    multipliers = least_multipliers(rows, multipliers, system.scales, tolerance, inverse.rank).multipliers
     ends = np.cumsum([len(entry) for entry in wanted.values])[:-1]
     misses = rows @ acceleration - right
     return acceleration, jnp.split(multipliers[len(loops) :], ends), jnp.split(misses[len(loops) :], ends)

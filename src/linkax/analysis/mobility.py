@@ -6,14 +6,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from linkax.equations.system import system_of
-from linkax.formulations.branches import Crossing
+from linkax.formulations.constraint_split import ConstraintSplit
+from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import least_multipliers, singularity_distance
 from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import require_type
 from linkax.model.topology import Topology
-from linkax.simulation.accuracy import BALANCED, Accuracy
-from linkax.simulation.given import check_accuracy, checked_state, checked_time, marked
-from linkax.simulation.state import State
-from linkax.tracing import runs_once
+from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
+from linkax.simulation.integrate.options import check_accuracy
+from linkax.simulation.integrate.run import DEFAULT_FORMULATION, checked_formulation
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.xla.tracing import quick_compile
 
 INVOLVED = 1e-6  # least part of a row in a self-stress of magnitude one
 # Table 1 of the paper: which axes of parent and child each rotation row keeps orthogonal.
@@ -70,31 +74,40 @@ def row_names(topology: Topology) -> tuple[tuple[str, str], ...]:
     )
 
 
-def mobility(mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = BALANCED) -> Mobility:
+def mobility(
+    mechanism: Mechanism,
+    state: State,
+    *,
+    t=0.0,
+    formulation: TangentSpace = DEFAULT_FORMULATION,
+    accuracy: Accuracy = BALANCED,
+) -> Mobility:
     """Rank, degrees of freedom and redundant constraints of a mechanism at a state on its closed loops.
 
-    **Arguments:** `t`: time [s]; `accuracy`: whose rank tolerance decides.
+    **Arguments:** `t`: time [s]; `formulation`: whose rank tolerance decides; `accuracy`: deprecated.
     """
     check_accuracy(accuracy)
+    formulation = checked_formulation(formulation, accuracy)
+    require_type(formulation, TangentSpace, "formulation", "give linkax.TangentSpace(...)")
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
-    return marked(mechanism, _mobility(mechanism, state, t, accuracy))
+    return marked(mechanism, _mobility(mechanism, state, t, formulation))
 
 
-@runs_once
-def _mobility(mechanism, state, t, accuracy):
-    system, topology = system_of(mechanism, state.q.dtype, fixed_units=False), mechanism.topology
-    tolerance = accuracy.method(system.dtype).rank_tolerance
-    crossing = Crossing.at(system, t, state.q, tolerance)
+@quick_compile
+def _mobility(mechanism, state, t, tangent_space):
+    system, topology = system_of(mechanism, state.q.dtype, fixed_scales=False), mechanism.topology
+    tolerance = tangent_space.prepared(system.dtype).rank_tolerance
+    crossing = ConstraintSplit.at(system, t, state.q, tolerance)
     rank, rows = jnp.sum(crossing.inverse.rank), crossing.jacobian
     dispensable = jnp.zeros(0, bool)
     if topology.num_rows:
-        free = least_multipliers(rows, rows[:, 0], system.units, tolerance, rank).free
+        free = least_multipliers(rows, rows[:, 0], system.scales, tolerance, rank).free
         dispensable = jnp.max(jnp.abs(free), axis=1, initial=0.0) > INVOLVED
     return Mobility(
         rank=rank,
         degrees_of_freedom=topology.num_speeds - rank,
         num_redundant=topology.num_rows + topology.num_immobile_rows - rank,
-        distance=singularity_distance(None, rows, system.units, tolerance, topology.islands),
+        distance=singularity_distance(None, rows, system.scales, tolerance, system.structure.islands),
         dispensable=jnp.concatenate([dispensable, jnp.ones(topology.num_immobile_rows, bool)]),
         topology=topology,
     )

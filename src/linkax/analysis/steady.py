@@ -18,9 +18,11 @@ from linkax.equations.motion import Motion
 from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known
-from linkax.simulation.state import State
-from linkax.tracing import one_by_one
+from linkax.simulation.start.state import State
+from linkax.spatial.vectors import largest
+from linkax.xla.batches import one_by_one
+from linkax.xla.derivatives import ratio
+from linkax.xla.tracing import concrete
 
 # Radians, or lengths of the mechanism, after which a motion is looked at again: incommensurable, so that what is
 # periodic does not repeat there.
@@ -32,7 +34,7 @@ eigh = one_by_one(jnp.linalg.eigh)
 
 def may_move(state: State) -> bool:
     """Whether a state moves, as far as it is known."""
-    v = known(state.v)
+    v = concrete(state.v)
     return v is None or bool(np.any(v != 0.0))
 
 
@@ -74,36 +76,28 @@ class Instants(NamedTuple):
     motion: Float[Array, "k n_v"]
 
 
-def fastest(system, v):
-    """The largest speed, in radians and lengths of the mechanism [1/s]."""
-    return jnp.max(jnp.abs(v / system.units), initial=0.0)
-
-
 def instants(system: System, t, v) -> Instants:
     """At `LATER`."""
-    speed = lax.stop_gradient(fastest(system, v))
-    duration = jnp.where(speed > 0.0, LATER / jnp.where(speed > 0.0, speed, 1.0), 0.0)
+    duration = ratio(LATER, lax.stop_gradient(system.fastest(v)), 0.0)
     return Instants(t + duration, duration[:, None] * v)
 
 
 def widest_gap(system: System, t, q) -> Float[Array, ""]:
     """How far the loops are open, in radians and lengths of the mechanism."""
-    loops = gaps(configure(system, t, q))
-    open_ = [loops.distance / system.length, loops.angle, loops.constraints / system.coupling_unit]
-    return jnp.max(jnp.concatenate(open_), initial=0.0)
+    return gaps(configure(system, t, q)).in_scales(system).widest()
 
 
 def missed_rates(system: System, t, q, v) -> Float[Array, " m"]:
     """What the speeds of a state miss of those that the loops and drives ask for, relative to the largest of both."""
     asked = rate(system, t)
-    largest = jnp.maximum(fastest(system, v), jnp.max(jnp.abs(asked), initial=0.0))
-    return jnp.abs(jacobian(configure(system, t, q)) @ v - asked) / jnp.where(largest > 0.0, largest, 1.0)
+    size = jnp.maximum(system.fastest(v), largest(asked))
+    return jnp.abs(jacobian(configure(system, t, q)) @ v - asked) / jnp.where(size > 0.0, size, 1.0)
 
 
 def of_missed_rate(mechanism: Mechanism, missed, row: int, t) -> str:
     """What asks for a rate that speeds miss, and the remedy; of `missed` those of constraints come last."""
     constraint = row - len(missed) + len(mechanism.constraints)
-    what = mechanism.constraints[constraint].described if constraint >= 0 else "a loop"
+    what = mechanism.constraints[constraint].display_name if constraint >= 0 else "a loop"
     return (
         f"{what} asks for a rate that the state's speeds miss by {missed[row]:.3g} of the largest "
         f"at t = {float(t):.6g} s; make the state with linkax.assemble at that time"
@@ -116,4 +110,4 @@ def largest_force(motion: Motion) -> Float[Array, ""]:
     force, moment = inertial_wrench(motion, motion.angular_bias[:-1], motion.bias[:-1])
     size = lambda vectors: jnp.sum(jnp.abs(vectors))
     on_bodies = system.length * (size(load.force) + size(force)) + size(load.moment) + size(moment)
-    return on_bodies + size(system.units * load.joint_force)
+    return on_bodies + size(system.scales * load.joint_force)

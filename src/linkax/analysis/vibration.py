@@ -13,7 +13,6 @@ from linkax.analysis.steady import (
     AGREES,
     Nearby,
     eigh,
-    fastest,
     instants,
     largest_force,
     may_move,
@@ -27,16 +26,17 @@ from linkax.equations.coordinates import carried, retract
 from linkax.equations.loops import jacobian
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
+from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known, whole_number
-from linkax.simulation.accuracy import BALANCED
-from linkax.simulation.diagnosis import massless_bodies
-from linkax.simulation.given import checked_state, checked_time, marked
-from linkax.simulation.outset import moving_joints
-from linkax.simulation.state import State
-from linkax.tracing import all_known, one_by_one, runs_once
+from linkax.model.numbers import whole_number
+from linkax.simulation.explain.diagnosis import massless_bodies
+from linkax.simulation.start.initial_state import moving_joints
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.xla.batches import one_by_one
+from linkax.xla.tracing import all_concrete, concrete, quick_compile
 
 NEAR = 1e-6  # distance from an equilibrium [rad, lengths of the mechanism] below which a state is in it
 UNFELT = 1e-9  # of all forces: what is left of them by rounding
@@ -69,8 +69,8 @@ class _Moving(Nearby):
 
     @staticmethod
     def of(system, method, t, q, v) -> "_Moving":
-        departure = method.departure(system, t, q)
-        crossing, mass = departure.crossing, departure.mass
+        departure = method.at_rest(system, t, q)
+        crossing, mass = departure.split, departure.mass
         fixed = crossing.inverse.basis
         still = jnp.zeros(len(crossing.jacobian), mass.dtype)
 
@@ -101,7 +101,7 @@ class _Moving(Nearby):
 
     def coefficients(self):
         """ÿ at rest in y, stiffness and damping."""
-        rest = jnp.zeros_like(self.system.units)
+        rest = jnp.zeros_like(self.system.scales)
         of_both = lambda both: self.acceleration(*jnp.split(both, 2))
         acceleration, slopes = self.slopes(of_both, jnp.concatenate([rest, rest]))
         return acceleration, *jnp.split(-slopes, 2, axis=1)
@@ -109,7 +109,7 @@ class _Moving(Nearby):
     def opens(self):
         """How far loops are open, or opened by what should keep them closed."""
         slopes = jacobian(configure(self.system, self.t, self.q)) @ self.basis
-        longest = jnp.max(jnp.abs(self.basis / self.system.units[:, None]), initial=0.0)
+        longest = jnp.max(jnp.abs(self.basis / self.system.scales[:, None]), initial=0.0)
         apart = jnp.max(jnp.abs(slopes), initial=0.0) / jnp.where(longest > 0.0, longest, 1.0)
         misses = missed_rates(self.system, self.t, self.q, self.v)
         gap = widest_gap(self.system, self.t, self.q)
@@ -201,20 +201,20 @@ def linearise(mechanism: Mechanism, state: State, *, t=0.0, degrees_of_freedom: 
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
     if degrees_of_freedom is None:
-        rank = known(_rank(mechanism, state, t))
+        rank = concrete(_rank(mechanism, state, t))
         if rank is None:
             raise ValueError("linearise inside a JAX transformation needs degrees_of_freedom=; give their number")
         degrees_of_freedom = mechanism.topology.num_speeds - int(rank)
     asked = whole_number(degrees_of_freedom, "degrees_of_freedom", least=0)
     found, there, steadiness = _linearise(mechanism, state, t, asked, may_move(state))
-    if known(there) is not None and there != asked:
+    if concrete(there) is not None and there != asked:
         raise ValueError(f"degrees_of_freedom is {asked}; the mechanism has {there} here: give that, or leave it out")
-    if not all_known((found, steadiness)):
+    if not all_concrete((found, steadiness)):
         mark = lambda leaf: jnp.where(steadiness.is_steady, leaf, jnp.nan)
         return marked(mechanism, jax.tree.map(mark, found))
     if not np.all(np.isfinite(found.natural_frequencies)):
         system = system_of(mechanism, state.q.dtype)
-        massless = massless_bodies(system, BALANCED.method(system.dtype), t, state.q)
+        massless = massless_bodies(system, TangentSpace().prepared(system.dtype), t, state.q)
         why = f"bodies {', '.join(map(repr, massless))} move without mass" if massless else "forces are not finite"
         raise ValueError(f"frequencies are not finite, because {why}; give mass and inertia, or finite numbers")
     _check_steady(mechanism, state, t, steadiness)
@@ -230,7 +230,7 @@ def _check_steady(mechanism, state, t, steadiness):
     acceleration = np.asarray(steadiness.acceleration)
     if not steadiness.off <= NEAR:
         system = system_of(mechanism, state.q.dtype)
-        column = int(np.argmax(np.abs(acceleration / np.asarray(system.units))))
+        column = int(np.argmax(np.abs(acceleration / np.asarray(system.scales))))
         joint = next(name for name, taken in topology.speeds.items() if taken.start <= column < taken.stop)
         raise ValueError(
             f"the state is {float(steadiness.off):.3g} off an equilibrium, in radians or lengths of the mechanism: "
@@ -245,17 +245,17 @@ def _check_steady(mechanism, state, t, steadiness):
         )
 
 
-@runs_once
+@quick_compile
 def _rank(mechanism, state, t):
     system = system_in(mechanism, state, t, False)
-    return jnp.sum(BALANCED.method(system.dtype).crossing(system, t, state.q).inverse.rank)
+    return jnp.sum(TangentSpace().prepared(system.dtype).constraint_split(system, t, state.q).inverse.rank)
 
 
-@runs_once
+@quick_compile
 def _linearise(mechanism, state, t, count, moves):
     system = system_in(mechanism, state, t, moves)
     rest = jnp.zeros(system.topology.num_speeds, system.dtype)
-    moving = _Moving.of(system, BALANCED.method(system.dtype), t, state.q, state.v if moves else rest)
+    moving = _Moving.of(system, TangentSpace().prepared(system.dtype), t, state.q, state.v if moves else rest)
     none = jnp.sum(moving.basis**2, axis=0) == 0.0
     columns = jnp.argsort(none)[:count]
 
@@ -278,7 +278,7 @@ def _linearise(mechanism, state, t, count, moves):
     if moves and count:
         gyroscopic = (damping - damping.T) / 2.0
         rounding = ROUNDING_ULPS * jnp.finfo(system.dtype).eps * jnp.max(jnp.abs(damping))
-        couples = jnp.max(jnp.abs(gyroscopic)) > UNFELT * fastest(system, moving.v) + rounding
+        couples = jnp.max(jnp.abs(gyroscopic)) > UNFELT * system.fastest(moving.v) + rounding
     # What is not asked for has eigenvalues apart from each other, and so derivatives.
     apart = jnp.diag(jnp.arange(1.0, len(symmetric) + 1.0, dtype=system.dtype) ** 2)
     values, vectors = eigh(jnp.where(couples, apart, symmetric))
@@ -306,13 +306,13 @@ class _Modes(NamedTuple):
     @staticmethod
     def of(system, basis, stiffness, v) -> "_Modes":
         values, vectors = eigh(stiffness)
-        return _Modes(basis @ vectors, vectors, jnp.maximum(jnp.abs(values), fastest(system, v) ** 2))
+        return _Modes(basis @ vectors, vectors, jnp.maximum(jnp.abs(values), system.fastest(v) ** 2))
 
 
 def _steadiness(moving, state, basis, modes, found) -> _Steadiness:
     """How steady a motion is, by its coefficients and open loops at several instants."""
     system, (accelerations, stiffness, damping, opens) = moving.system, found
-    size = jnp.max(jnp.abs(modes.of_joints / system.units[:, None]), axis=0, initial=0.0)
+    size = jnp.max(jnp.abs(modes.of_joints / system.scales[:, None]), axis=0, initial=0.0)
     forces = largest_force(move(configure(system, moving.t, moving.q), moving.v))
     along = jnp.abs(accelerations @ modes.vectors)
     felt = along > UNFELT * size * forces

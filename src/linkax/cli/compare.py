@@ -4,7 +4,7 @@ import json
 from functools import partial
 
 from linkax.cli.options import (
-    Run,
+    RunOptions,
     add_run_options,
     at_interrupt_in,
     end_progress,
@@ -15,10 +15,10 @@ from linkax.cli.options import (
     steps_in_words,
     write_json,
 )
+from linkax.cli.report import finite
 from linkax.formulations.named import BASES, COMPARED, TANGENT_SPACE, formulation
-from linkax.simulation.files import written_whole
-from linkax.simulation.report import finite
 from linkax.studies.comparison import TIGHTEST, Comparison, Stepping, at_equal_cost, compare
+from linkax.studies.files import written_whole
 
 LADDER = (1e2, 1e1, 1.0, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances, of the one asked for, from which equal cost chooses
 STEP_LADDER = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # steps likewise
@@ -47,10 +47,10 @@ def add_command(commands):
 
 
 def _compare(arguments):
-    asked = Run(arguments)
+    asked = RunOptions(arguments)
     names = {name.strip(): formulation(name.strip()) for name in arguments.formulations.split(",")}
     if arguments.equal == "cost":
-        names = {TANGENT_SPACE: None} | names
+        names = {TANGENT_SPACE: formulation(TANGENT_SPACE)} | names
     mechanism = asked.mechanism.with_all_rows() if arguments.all_rows else asked.mechanism
     settings = asked.described | {
         "formulations": list(names),

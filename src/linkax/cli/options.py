@@ -12,9 +12,9 @@ import diffrax
 
 import linkax as lx
 from linkax.scenes import scene
-from linkax.simulation.files import remove_unfinished, writable_folder, written_whole
-from linkax.simulation.runge_kutta import RungeKutta4
-from linkax.simulation.solvers import default_solver
+from linkax.simulation.integrate.default_solver import default_solver
+from linkax.simulation.integrate.runge_kutta import RungeKutta4
+from linkax.studies.files import remove_unfinished, writable_folder, written_whole
 from linkax_command import at_interrupt
 
 PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
@@ -38,7 +38,7 @@ def add_run_options(parser):
     parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
 
 
-class Run:
+class RunOptions:
     """What the options of `add_run_options` ask for."""
 
     def __init__(self, arguments):

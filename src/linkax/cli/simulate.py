@@ -6,7 +6,7 @@ import sys
 import numpy as np
 
 from linkax.cli.options import (
-    Run,
+    RunOptions,
     add_run_options,
     at_interrupt_in,
     end_progress,
@@ -15,11 +15,11 @@ from linkax.cli.options import (
     steps_in_words,
     write_json,
 )
+from linkax.cli.progress_run import simulate_in_segments
+from linkax.cli.report import states, summary, trajectory
 from linkax.formulations.named import TANGENT_SPACE, formulation
-from linkax.simulation.diagnosis import cause
-from linkax.simulation.files import written_whole
-from linkax.simulation.report import states, summary, trajectory
-from linkax.simulation.segments import simulate_in_segments
+from linkax.simulation.explain.diagnosis import cause
+from linkax.studies.files import written_whole
 
 INTERVALS = 1000
 SHOWN = 5
@@ -36,7 +36,7 @@ def add_command(commands):
 
 
 def _simulate(arguments):
-    asked, chosen = Run(arguments), formulation(arguments.formulation)
+    asked, chosen = RunOptions(arguments), formulation(arguments.formulation)
     settings = asked.described | {"formulation": arguments.formulation}
     out = output_folder(arguments.out, asked.scene.name, settings, ("summary.json", PART[1]))
     at_interrupt_in(out)

@@ -13,22 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.coordinates import by_speed
+from linkax.equations.coordinates import coordinates_by_speed
 from linkax.equations.system import System
-from linkax.linalg.placing import placed
-from linkax.linalg.sparse_products import constant_product
+from linkax.linalg.static_sparse import constant_product
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.forces import Load
 from linkax.model.joints.bending import section_at
-from linkax.model.joints.joint import Motion
+from linkax.model.joints.joint import RelativeMotion
 from linkax.model.numbers import value
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.screws import turn_rate
 from linkax.spatial.vectors import cross, dot
-from linkax.tracing import differentiated_whole, traced_once
+from linkax.xla.derivatives import whole_jacobian
+from linkax.xla.static_scatter import scatter_static
+from linkax.xla.tracing import jit_inline
 
 
 class Configuration(eqx.Module):
@@ -134,7 +135,7 @@ class Configuration(eqx.Module):
         """One coordinate of a joint from an origin; angles of a cut joint in [−π, π)."""
         index, topology = term.index or 0, self.system.topology
         if term.joint in topology.speeds:
-            return by_speed(topology, self.q)[topology.column(term)] - origin
+            return coordinates_by_speed(topology, self.q)[topology.column(term)] - origin
         kind = topology.joint_types[topology.joints.index(term.joint)]
         displacement = self.joint_coordinates(term.joint)[index + kind.has_quaternion] - origin
         return wrapped(displacement, kind.speed_units[index] == "rad")
@@ -173,7 +174,7 @@ def over_subtree(system: System, bodies):
     return constant_product(system.topology.path[:-1].T, bodies)
 
 
-def by_body(system: System, motions):
+def sum_by_body(system: System, motions):
     """Sum what motions (n_m, 3) contribute for the body that each moves: (n_b, 3)."""
     topology = system.topology
     if np.array_equal(topology.moved_body, np.arange(topology.num_bodies)):
@@ -182,12 +183,12 @@ def by_body(system: System, motions):
     return constant_product(onto, motions)
 
 
-def of_motions(topology, speeds):
+def expand_to_motions(topology, speeds):
     """What belongs to speeds (n_v, …), for the motions that they cause: (n_m, …)."""
     return speeds if topology.motion_column is None else speeds[topology.motion_column]
 
 
-def by_speed_of(topology, motions):
+def sum_by_speed(topology, motions):
     """Sum what belongs to motions (…, n_m) for the speed that causes each: (…, n_v)."""
     if topology.motion_column is None:
         return motions
@@ -201,7 +202,7 @@ def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " 
     body = topology.moved_body
     arm = configuration.position[:-1] + configuration.center_of_mass()
     force, moment = over_subtree(system, force), over_subtree(system, moment + cross(arm, force))
-    return by_speed_of(topology, dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body]))
+    return sum_by_speed(topology, dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body]))
 
 
 def beam_point(configuration: Configuration, beam: Beam, point) -> Float[Array, "3"]:
@@ -220,7 +221,7 @@ def bodies_of_cuts(topology):
     return np.array(topology.parent, dtype=int)[cuts], np.array(topology.child, dtype=int)[cuts], cuts
 
 
-@traced_once
+@jit_inline
 def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
     """Poses of all bodies and the motion subspaces of all joints at coordinates q."""
     topology, count = system.topology, system.topology.num_bodies
@@ -272,22 +273,23 @@ def _joint_motions(system, q):
     topology, order, turns = system.topology, [], []
     angular = jnp.asarray(_constant_subspace(topology, "angular_subspace"), q.dtype)
     linear = _linear_subspace(system)
-    shift = by_body(system, linear * of_motions(topology, by_speed(topology, q))[:, None])
-    for kind in topology.kinds:
-        if isinstance(kind.motion, Motion):
+    shift = sum_by_body(system, linear * expand_to_motions(topology, coordinates_by_speed(topology, q))[:, None])
+    for kind in topology.joint_groups:
+        if isinstance(kind.motion, RelativeMotion):
             continue
-        turn = jax.vmap(kind.motion.rotation)(q[kind.places])
+        turn = jax.vmap(kind.motion.rotation)(q[kind.coordinates])
         if kind.motion.angular_subspace_at is not None:
-            turned = jax.vmap(kind.motion.angular_subspace_at)(q[kind.places])
-            angular = placed(angular, _motions_of(topology, kind), turned)
+            turned = jax.vmap(kind.motion.angular_subspace_at)(q[kind.coordinates])
+            angular = scatter_static(angular, _motions_of(topology, kind), turned)
         turns.append(turn)
         order += kind.bodies
-    for kind, (turn, away, *subspace) in over_bending(_bent, system, lambda kind: (q[kind.places],)):
-        motions, count = _motions_of(topology, kind), kind.places.shape[1]
+    for kind, (turn, away, *subspace) in over_bending(_bent, system, lambda kind: (q[kind.coordinates],)):
+        motions, count = _motions_of(topology, kind), kind.coordinates.shape[1]
         angular, linear = (
-            placed(whole, motions, part[:, :count]) for whole, part in zip((angular, linear), subspace, strict=True)
+            scatter_static(whole, motions, part[:, :count])
+            for whole, part in zip((angular, linear), subspace, strict=True)
         )
-        shift = placed(shift, kind.bodies, away)
+        shift = scatter_static(shift, kind.bodies, away)
         turns.append(turn)
         order += kind.bodies
     turn = turns[0] if len(turns) == 1 else jnp.concatenate(turns)[np.argsort(order)]
@@ -300,11 +302,11 @@ def over_bending(function, system, read):
     `read`: the arrays of a kind, (n, k) each.
     """
     alike = {}
-    for kind, numbers in zip(system.topology.kinds, system.numbers, strict=True):
+    for kind, numbers in zip(system.topology.joint_groups, system.group_parameters, strict=True):
         if numbers is not None:
             alike.setdefault(kind.motion, []).append((kind, numbers))
     for motion, members in alike.items():
-        most = max(kind.places.shape[1] for kind, _ in members)
+        most = max(kind.coordinates.shape[1] for kind, _ in members)
         arrays = [
             (*(jnp.pad(array, ((0, 0), (0, most - array.shape[1]))) for array in read(kind)), numbers)
             for kind, numbers in members
@@ -323,7 +325,7 @@ def _motions_of(topology, kind):
     return np.flatnonzero(np.isin(topology.moved_body, kind.bodies))
 
 
-@differentiated_whole
+@whole_jacobian
 def _bent(motion, coordinates, numbers):
     """Rotation and translation of a `Motion`, and its subspace, angular and linear, (n, 3) each."""
     follow = lambda change: jax.jvp(lambda q: motion(q, numbers), (coordinates,), (change,))

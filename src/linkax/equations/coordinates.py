@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.linalg.placing import placed
 from linkax.model.topology import Topology
 from linkax.spatial.quaternions import conjugate, from_rotation_vector, multiply, normalised, rotation_matrix
 from linkax.spatial.rotations import rotate
+from linkax.xla.static_scatter import scatter_static
 
 
 def _places(topology):
@@ -22,7 +22,7 @@ def _places(topology):
 
 def _of_plain(topology, v):
     """Speeds (n_v,) at the places of their coordinates (n_q,), zero for quaternions."""
-    return placed(jnp.zeros(topology.num_coordinates, v.dtype), topology.plain[:, 0], v[topology.plain[:, 1]])
+    return scatter_static(jnp.zeros(topology.num_coordinates, v.dtype), topology.plain[:, 0], v[topology.plain[:, 1]])
 
 
 def neutral(topology: Topology, dtype) -> Float[Array, " n_q"]:
@@ -38,7 +38,7 @@ def retract(topology: Topology, q, change) -> Float[Array, " n_q"]:
         return q + change
     in_q, in_v = _places(topology)
     turned = normalised(multiply(from_rotation_vector(change[in_v]), q[in_q]))
-    return placed(q + _of_plain(topology, change), in_q, turned)
+    return scatter_static(q + _of_plain(topology, change), in_q, turned)
 
 
 def carried(topology: Topology, motion, change) -> Float[Array, " n_v"]:
@@ -47,7 +47,7 @@ def carried(topology: Topology, motion, change) -> Float[Array, " n_v"]:
         return change
     _, in_v = _places(topology)
     turn = rotation_matrix(from_rotation_vector(motion[in_v]))
-    return placed(change, in_v, rotate(turn, change[in_v]))
+    return scatter_static(change, in_v, rotate(turn, change[in_v]))
 
 
 def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:
@@ -55,7 +55,7 @@ def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:
     if not len(topology.quaternions):
         return q
     in_q, _ = _places(topology)
-    return placed(q, in_q, normalised(q[in_q]))
+    return scatter_static(q, in_q, normalised(q[in_q]))
 
 
 def rates(topology: Topology, q, v) -> Float[Array, " n_q"]:
@@ -65,7 +65,7 @@ def rates(topology: Topology, q, v) -> Float[Array, " n_q"]:
     in_q, in_v = _places(topology)
     omega = v[in_v]
     turning = 0.5 * multiply(jnp.concatenate([jnp.zeros_like(omega[:, :1]), omega], axis=-1), q[in_q])
-    return placed(_of_plain(topology, v), in_q, turning)
+    return scatter_static(_of_plain(topology, v), in_q, turning)
 
 
 def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
@@ -74,11 +74,11 @@ def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
         return rates
     in_q, in_v = _places(topology)
     omega = 2.0 * multiply(rates[in_q], conjugate(q[in_q]))[:, 1:]
-    return placed(by_speed(topology, rates), in_v, omega)
+    return scatter_static(coordinates_by_speed(topology, rates), in_v, omega)
 
 
-def by_speed(topology: Topology, q) -> Float[Array, " n_v"]:
+def coordinates_by_speed(topology: Topology, q) -> Float[Array, " n_v"]:
     """The coordinates at the places of their speeds, zero for those of quaternions."""
     if not len(topology.quaternions):
         return q
-    return placed(jnp.zeros(topology.num_speeds, q.dtype), topology.plain[:, 1], q[topology.plain[:, 0]])
+    return scatter_static(jnp.zeros(topology.num_speeds, q.dtype), topology.plain[:, 1], q[topology.plain[:, 0]])

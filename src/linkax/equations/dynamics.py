@@ -15,13 +15,13 @@ from linkax.equations.configuration import (
     Configuration,
     along_path,
     along_speeds,
-    by_body,
-    by_speed_of,
-    of_motions,
+    expand_to_motions,
     over_subtree,
+    sum_by_body,
+    sum_by_speed,
 )
 from linkax.equations.motion import Motion
-from linkax.linalg.sparse_products import Placed, constant_product, products_of_pairs
+from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
@@ -47,7 +47,7 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
     return mass_entries(configuration).dense()
 
 
-def mass_entries(configuration: Configuration) -> Placed:
+def mass_entries(configuration: Configuration) -> StaticSparse:
     """`mass_matrix` by its entries: those of speeds of which one moves what the other does."""
     system, topology = configuration.system, configuration.system.topology
     above = lambda carried: _onto_carrier(np.array(topology.predecessor), carried)
@@ -72,7 +72,7 @@ def mass_entries(configuration: Configuration) -> Placed:
     found = products_of_pairs(carrier, carried, twist, wrench)
     if topology.motion_column is None:
         return found
-    return Placed.whole(by_speed_of(topology, by_speed_of(topology, found.dense()).T))
+    return StaticSparse.whole(sum_by_speed(topology, sum_by_speed(topology, found.dense()).T))
 
 
 def _onto_carrier(carrier, carried):
@@ -133,8 +133,8 @@ def potential_energy(configuration: Configuration) -> Float[Array, ""]:
 def body_accelerations(motion: Motion, acceleration: Float[Array, " n_v"]):
     """Angular accelerations and accelerations of reference points at v̇, (n_b, 3) each."""
     configuration, system = motion.configuration, motion.system
-    acceleration = of_motions(system.topology, acceleration)[:, None]
-    angular = along_path(system, by_body(system, configuration.angular * acceleration))[:-1]
-    at_anchor = along_path(system, by_body(system, configuration.linear * acceleration))[:-1]
+    acceleration = expand_to_motions(system.topology, acceleration)[:, None]
+    angular = along_path(system, sum_by_body(system, configuration.angular * acceleration))[:-1]
+    at_anchor = along_path(system, sum_by_body(system, configuration.linear * acceleration))[:-1]
     linear = at_anchor + cross(angular, configuration.position[:-1])
     return motion.angular_bias[:-1] + angular, motion.bias[:-1] + linear

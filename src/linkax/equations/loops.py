@@ -15,20 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, along_speeds, bodies_of_cuts, by_speed_of
-from linkax.equations.coordinates import by_speed
+from linkax.equations.configuration import Configuration, along_speeds, bodies_of_cuts, sum_by_speed
+from linkax.equations.coordinates import coordinates_by_speed
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
-from linkax.linalg.sparse_products import Placed, constant_product, products_of_pairs
+from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs
 from linkax.model.ropes import Rope
 from linkax.spatial.rotations import rotate, transpose
 from linkax.spatial.vectors import cross, dot
-from linkax.tracing import traced_once
+from linkax.xla.tracing import jit_inline
 
 FLIP_WEIGHT = 2.0  # more than one: axes that point apart are farther from being in line than those at a right angle
 
 
-class Rows(NamedTuple):
+class RowVectors(NamedTuple):
     """The vectors that rows of cut joints are made of: h₁ⁱ and h₂ʲ, and h₁ⁱ with its loop's ℓ."""
 
     rotation_cut: np.ndarray
@@ -39,11 +39,11 @@ class Rows(NamedTuple):
     length: Float[Array, " n_tr"]
 
 
-def _chosen(configuration: Configuration, rotation_rows, translation_rows) -> Rows:
+def _chosen(configuration: Configuration, rotation_rows, translation_rows) -> RowVectors:
     rotation = np.array(rotation_rows, dtype=int).reshape(-1, 3)
     translation = np.array(translation_rows, dtype=int).reshape(-1, 2)
     columns, other = transpose(configuration.parent_axes), transpose(configuration.child_axes)
-    return Rows(
+    return RowVectors(
         rotation_cut=rotation[:, 0],
         translation_cut=translation[:, 0],
         first=columns[rotation[:, 0], rotation[:, 1]],
@@ -53,19 +53,19 @@ def _chosen(configuration: Configuration, rotation_rows, translation_rows) -> Ro
     )
 
 
-def plain_rows(configuration: Configuration) -> Rows:
+def plain_rows(configuration: Configuration) -> RowVectors:
     """The rotation and translation rows that motion can change."""
     topology = configuration.system.topology
     return _chosen(configuration, topology.rotation_rows, topology.translation_rows)
 
 
-def immobile_rows(configuration: Configuration) -> Rows:
+def immobile_rows(configuration: Configuration) -> RowVectors:
     """The rotation and translation rows that no motion can change."""
     topology = configuration.system.topology
     return _chosen(configuration, topology.immobile_rotation_rows, topology.immobile_translation_rows)
 
 
-def combined_rows(configuration: Configuration) -> Rows:
+def combined_rows(configuration: Configuration) -> RowVectors:
     """The rotation and translation rows that combined rows are functions of."""
     topology = configuration.system.topology
     kinds = topology.joint_types[topology.num_bodies :]
@@ -82,13 +82,13 @@ def _combine(system: System, rows: Float[Array, " n"]) -> Float[Array, " n_combi
     rotations, translations = rows[:count], rows[count:]
     for cut in topology.combining:
         turns, moves = len(kinds[cut].combined_rotations), len(kinds[cut].combined_translations)
-        number = system.number[topology.num_bodies + cut] / system.loop_length[cut]
+        number = system.joint_parameter[topology.num_bodies + cut] / system.loop_length[cut]
         found.append(kinds[cut].combined(rotations[:turns], translations[:moves], number))
         rotations, translations = rotations[turns:], translations[moves:]
     return jnp.stack(found)
 
 
-def _residual(configuration: Configuration, rows: Rows):
+def _residual(configuration: Configuration, rows: RowVectors):
     rotation = dot(rows.first, rows.second)
     translation = dot(rows.direction, configuration.separation[rows.translation_cut]) / rows.length
     return jnp.concatenate([rotation, translation])
@@ -117,7 +117,7 @@ def residual(configuration: Configuration) -> Float[Array, " m"]:
     if system.topology.combining:
         rows.append(_combine(system, _residual(configuration, combined_rows(configuration))))
     if system.constraints:
-        coordinates = by_speed(system.topology, configuration.q)
+        coordinates = coordinates_by_speed(system.topology, configuration.q)
         values = system.coupling @ coordinates
         for row, rope in ropes(system):
             values = values.at[row].set(rope.value(configuration))
@@ -130,7 +130,7 @@ def immobile_residual(configuration: Configuration) -> Float[Array, " m_immobile
     return _residual(configuration, immobile_rows(configuration))
 
 
-def _jacobian(configuration: Configuration, rows: Rows) -> Placed:
+def _jacobian(configuration: Configuration, rows: RowVectors) -> StaticSparse:
     topology = configuration.system.topology
     parent, child, joints = bodies_of_cuts(topology)
     # The twist of each joint at the point where the loop is cut, reached along its own side.
@@ -149,7 +149,7 @@ def _jacobian(configuration: Configuration, rows: Rows) -> Placed:
         jnp.concatenate([turning, moving], axis=1),
         jnp.concatenate([configuration.angular, configuration.linear], axis=1),
     )
-    return found if topology.motion_column is None else Placed.whole(by_speed_of(topology, found.dense()))
+    return found if topology.motion_column is None else StaticSparse.whole(sum_by_speed(topology, found.dense()))
 
 
 def _combination(configuration: Configuration):
@@ -167,20 +167,20 @@ def jacobian(configuration: Configuration) -> Float[Array, "m n_v"]:
     return jacobian_entries(configuration).dense()
 
 
-def jacobian_entries(configuration: Configuration) -> Placed:
+def jacobian_entries(configuration: Configuration) -> StaticSparse:
     """`jacobian` by its entries: those of speeds that move a loop."""
     system = configuration.system
     rows = [_jacobian(configuration, plain_rows(configuration))]
     if system.topology.combining:
         values, slopes = _combination(configuration)
-        rows.append(Placed.whole(_combining_factors(configuration, values) @ slopes))
+        rows.append(StaticSparse.whole(_combining_factors(configuration, values) @ slopes))
     if system.constraints:
         slopes = system.coupling
         for row, rope in ropes(system):
             unit_load = rope.load(configuration, 1.0)
             slopes = slopes.at[row].set(along_speeds(configuration, unit_load.force, unit_load.moment))
-        rows.append(Placed.whole(slopes / system.coupling_unit[:, None]))
-    return Placed.stacked(rows)
+        rows.append(StaticSparse.whole(slopes / system.coupling_unit[:, None]))
+    return StaticSparse.stacked(rows)
 
 
 def rate(system: System, t) -> Float[Array, " m"]:
@@ -201,7 +201,7 @@ def drive_acceleration(system: System, t) -> Float[Array, " m"]:
     return sides
 
 
-def _bias(motion: Motion, rows: Rows):
+def _bias(motion: Motion, rows: RowVectors):
     """Minus all terms of c̈ that velocities alone cause, of rotation and translation rows."""
     configuration, topology = motion.configuration, motion.system.topology
     parent, child, joints = bodies_of_cuts(topology)
@@ -233,8 +233,8 @@ def _bias(motion: Motion, rows: Rows):
     return -jnp.concatenate([rotation, translation])
 
 
-@traced_once
-def bias(motion: Motion) -> Float[Array, " m"]:
+@jit_inline
+def velocity_gamma(motion: Motion) -> Float[Array, " m"]:
     """γ of J v̇ = γ less `drive_acceleration`: quadratic in the speeds."""
     system, configuration = motion.system, motion.configuration
     rows = [_bias(motion, plain_rows(configuration))]
@@ -256,7 +256,7 @@ def bias(motion: Motion) -> Float[Array, " m"]:
 
 def gamma(motion: Motion) -> Float[Array, " m"]:
     """γ of J v̇ = γ."""
-    return bias(motion) + drive_acceleration(motion.system, motion.configuration.t)
+    return velocity_gamma(motion) + drive_acceleration(motion.system, motion.configuration.t)
 
 
 class Multipliers(NamedTuple):
@@ -324,6 +324,14 @@ class Gap(NamedTuple):
     distance: Float[Array, " n_cut"]
     angle: Float[Array, " n_cut"]
     constraints: Float[Array, " k"]
+
+    def in_scales(self, system: System) -> "Gap":
+        """The same in radians and lengths of the mechanism."""
+        return Gap(self.distance / system.length, self.angle, self.constraints / system.coupling_unit)
+
+    def widest(self) -> Float[Array, ""]:
+        """The largest of all; not a number where one is none."""
+        return jnp.max(jnp.concatenate(self), initial=0.0)
 
 
 def gaps(configuration: Configuration) -> Gap:

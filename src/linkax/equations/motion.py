@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, along_path, by_body, of_motions, over_bending
+from linkax.equations.configuration import Configuration, along_path, expand_to_motions, over_bending, sum_by_body
 from linkax.equations.system import System
-from linkax.linalg.placing import placed
 from linkax.model.bodies import Frame
 from linkax.model.forces import Load
 from linkax.model.terms import Term
 from linkax.spatial.rotations import rotate
 from linkax.spatial.screws import turn_rate
 from linkax.spatial.vectors import cross
-from linkax.tracing import differentiated_whole, traced_once
+from linkax.xla.derivatives import whole_jacobian
+from linkax.xla.static_scatter import scatter_static
+from linkax.xla.tracing import jit_inline
 
 
 class Motion(eqx.Module):
@@ -103,7 +104,7 @@ def _alone(values):
     return values[0] if len(values) == 1 else values
 
 
-@traced_once
+@jit_inline
 def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
     """Twists and velocity-product accelerations of all bodies at speeds v."""
     system = configuration.system
@@ -112,9 +113,9 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
     sign = jnp.where(topology.reversed[:, None], -1.0, 1.0).astype(v.dtype)
     parent_arm, child_arm = configuration.parent_arm[:count], configuration.child_arm[:count]
 
-    speed = of_motions(topology, v)[:, None]
-    edge_turn = by_body(system, configuration.angular * speed)
-    edge_slide = by_body(system, configuration.sliding * speed)
+    speed = expand_to_motions(topology, v)[:, None]
+    edge_turn = sum_by_body(system, configuration.angular * speed)
+    edge_slide = sum_by_body(system, configuration.sliding * speed)
     omega = along_path(system, edge_turn)
     edge_angular_bias = cross(omega[parent], edge_turn)
     turned, slid = _subspace_bias(configuration, v)
@@ -151,8 +152,8 @@ def _subspace_bias(configuration, v):
     system, topology = configuration.system, configuration.system.topology
     angular, linear = {}, {}
     speeds = lambda kind: v[np.stack([topology.columns(body) for body in kind.bodies])]
-    read = lambda kind: (configuration.q[kind.places], speeds(kind))
-    turning = [kind for kind in topology.kinds if getattr(kind.motion, "angular_subspace_at", None) is not None]
+    read = lambda kind: (configuration.q[kind.coordinates], speeds(kind))
+    turning = [kind for kind in topology.joint_groups if getattr(kind.motion, "angular_subspace_at", None) is not None]
     found = [(kind, (jax.vmap(partial(_turning, kind.motion))(*read(kind)),)) for kind in turning]
     for kind, accelerations in (*found, *over_bending(_bending, system, read)):
         for parts, part in zip((angular, linear), accelerations, strict=False):
@@ -165,7 +166,7 @@ def _scattered(topology, parts):
     if not parts:
         return None
     members, values = np.concatenate([np.array(bodies) for bodies in parts]), jnp.concatenate([*parts.values()])
-    return placed(jnp.zeros((topology.num_bodies, 3), values.dtype), members, values)
+    return scatter_static(jnp.zeros((topology.num_bodies, 3), values.dtype), members, values)
 
 
 def _turning(kind, coordinates, speeds):
@@ -173,7 +174,7 @@ def _turning(kind, coordinates, speeds):
     return speeds @ jax.jvp(kind.angular_subspace_at, (coordinates,), (speeds,))[1]
 
 
-@differentiated_whole
+@whole_jacobian
 def _bending(motion, coordinates, speeds, numbers):
     """Angular and linear acceleration of a `Motion` at constant speeds."""
     place = lambda coordinates: motion(coordinates, numbers)

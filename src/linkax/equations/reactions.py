@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, bodies_of_cuts, by_body, of_motions, over_subtree
+from linkax.equations.configuration import Configuration, bodies_of_cuts, expand_to_motions, over_subtree, sum_by_body
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
-from linkax.equations.loops import Rows, combined_rows, immobile_rows, plain_rows, ropes, sorted_multipliers
+from linkax.equations.loops import RowVectors, combined_rows, immobile_rows, plain_rows, ropes, sorted_multipliers
 from linkax.equations.motion import Motion
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
@@ -44,7 +44,7 @@ def cut_reactions(configuration: Configuration, multipliers, immobile=None) -> R
     return reaction
 
 
-def _added(reaction: Reaction, rows: Rows, multipliers) -> Reaction:
+def _added(reaction: Reaction, rows: RowVectors, multipliers) -> Reaction:
     of_rotations, of_translations = jnp.split(multipliers, [len(rows.rotation_cut)])
     moments = of_rotations[:, None] * cross(rows.second, rows.first)
     forces = (of_translations / rows.length)[:, None] * rows.direction
@@ -121,8 +121,8 @@ def _carried(configuration: Configuration, needed: Load, cut: Reaction, multipli
     kinds = topology.joint_types[:count]
     turns = np.array([kind.motion is None for kind in kinds])[topology.moved_body]
     slides = np.array([kind.motion is None and not kind.is_screw for kind in kinds])[topology.moved_body]
-    along = of_motions(topology, joint_force)[:, None]
-    force = force - by_body(system, slides[:, None] * along * configuration.sliding)
-    moment = moment - by_body(system, turns[:, None] * along * configuration.angular)
+    along = expand_to_motions(topology, joint_force)[:, None]
+    force = force - sum_by_body(system, slides[:, None] * along * configuration.sliding)
+    moment = moment - sum_by_body(system, turns[:, None] * along * configuration.angular)
     sign = jnp.where(topology.reversed[:, None], -1.0, 1.0).astype(system.dtype)
     return Reaction(jnp.concatenate([sign * force, cut.force]), jnp.concatenate([sign * moment, cut.moment]))

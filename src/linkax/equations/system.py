@@ -6,9 +6,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from linkax.equations.structure import Structure, structure_of
 from linkax.model.constraints import AbstractConstraint, LinearConstraint
 from linkax.model.forces import AbstractForce
-from linkax.model.joints.joint import Motion
+from linkax.model.joints.joint import RelativeMotion
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import length as length_of
@@ -23,8 +24,9 @@ class System(eqx.Module):
       zero on ground, whose part is kept apart in `anchor` [m] (n_j, 3), world axes, so that
       a mechanism far from the origin loses no digits.
     - `parent_axes`, `child_axes` (n_j, 3, 3): the joint's axes as columns, in body axes.
-    - `number` [m] (n_j,): the number of a joint whose type has one.
-    - `numbers`: of each of the topology's `kinds` with a `Motion` those of its joints, (n, k); None for the others.
+    - `joint_parameter` [m] (n_j,): the parameter of a joint whose type has one.
+    - `group_parameters`: for each of the topology's `joint_groups` with a `RelativeMotion` the parameters of its
+      joints, (n, k); None for the others.
     - `loop_length` [m] (n_cut,): half the way around each loop, the unit of its translation rows.
     - `length` [m]: the mechanism's length, the unit of sliding coordinates.
     - `coupling` (k, n_v): coefficients of the constraints on coordinates of the tree, and
@@ -40,8 +42,8 @@ class System(eqx.Module):
     anchor: Float[Array, "n_j 3"]
     parent_axes: Float[Array, "n_j 3 3"]
     child_axes: Float[Array, "n_j 3 3"]
-    number: Float[Array, " n_j"]
-    numbers: tuple[Float[Array, "n k"] | None, ...]
+    joint_parameter: Float[Array, " n_j"]
+    group_parameters: tuple[Float[Array, "n k"] | None, ...]
     loop_length: Float[Array, " n_cut"]
     length: Float[Array, ""]
     coupling: Float[Array, "k n_v"]
@@ -54,15 +56,24 @@ class System(eqx.Module):
         return self.mass.dtype
 
     @property
-    def units(self) -> Float[Array, " n_v"]:
+    def structure(self) -> Structure:
+        """Islands and elimination plan of its equations."""
+        return structure_of(self.topology)
+
+    @property
+    def scales(self) -> Float[Array, " n_v"]:
         """What one unit of each speed, or of a small change, is: 1 rad, or the mechanism's length [m]."""
         return jnp.where(self.topology.slides, self.length, jnp.ones((), self.dtype))
 
+    def fastest(self, v) -> Float[Array, ""]:
+        """The largest speed of v, (n_v,), or change, in radians and lengths of the mechanism: max |v / scales|."""
+        return jnp.max(jnp.abs(v / self.scales), initial=0.0)
 
-def system_of(mechanism: Mechanism, dtype, fixed_units: bool = True) -> System:
+
+def system_of(mechanism: Mechanism, dtype, fixed_scales: bool = True) -> System:
     """Stack the numbers of a mechanism in the given floating-point type.
 
-    `fixed_units`: the lengths that are units have no derivative, since no motion depends on them. What is
+    `fixed_scales`: the lengths that are units have no derivative, since no motion depends on them. What is
     told in them does, such as the distance from a singular configuration.
     """
     topology, joints = mechanism.topology, mechanism.joints
@@ -77,9 +88,9 @@ def system_of(mechanism: Mechanism, dtype, fixed_units: bool = True) -> System:
     parent_on_ground = (np.array(topology.parent) == GROUND_INDEX)[:, None]
     child_on_ground = (np.array(topology.child) == GROUND_INDEX)[:, None]
     center_of_mass = stack([body.center_of_mass for body in mechanism.bodies], (3,))
-    fixed = lax.stop_gradient if fixed_units else lambda array: array
+    fixed = lax.stop_gradient if fixed_scales else lambda array: array
     bends = np.array([joint.kind.motion is not None for joint in joints], dtype=bool)
-    reach = stack([joint.reach for joint in joints], ()) if np.any(bends) else None
+    reach = stack([joint.length_estimate for joint in joints], ()) if np.any(bends) else None
     loop_length, length = _lengths(topology, *map(fixed, (parent_offset, child_offset, center_of_mass)), reach)
     coupling = _coupling(mechanism, dtype)
     slides = jnp.where(topology.slides, length, jnp.ones((), dtype))
@@ -93,11 +104,13 @@ def system_of(mechanism: Mechanism, dtype, fixed_units: bool = True) -> System:
         anchor=jnp.where(parent_on_ground, parent_offset, jnp.where(child_on_ground, child_offset, 0.0)),
         parent_axes=stack([parent for parent, _ in frames], (3, 3)),
         child_axes=stack([child for _, child in frames], (3, 3)),
-        numbers=tuple(
-            stack([joints[body].numbers for body in kind.bodies], ()) if isinstance(kind.motion, Motion) else None
-            for kind in topology.kinds
+        group_parameters=tuple(
+            stack([joints[body].parameters for body in kind.bodies], ())
+            if isinstance(kind.motion, RelativeMotion)
+            else None
+            for kind in topology.joint_groups
         ),
-        number=stack([0.0 if joint.number is None else joint.number for joint in joints], ()),
+        joint_parameter=stack([0.0 if joint.parameter is None else joint.parameter for joint in joints], ()),
         loop_length=loop_length,
         length=length,
         coupling=coupling,

@@ -14,9 +14,10 @@ from linkax.equations.dynamics import generalised_force
 from linkax.equations.loops import gamma, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
-from linkax.formulations.formulation import AbstractFormulation, Coefficients, Dynamics, coefficients
+from linkax.formulations.formulation import AbstractFormulation, Dynamics, LinearSystem, linear_system
 from linkax.model.numbers import whole_number, zero_or_more
-from linkax.tracing import one_by_one, traced_once
+from linkax.xla.batches import one_by_one
+from linkax.xla.tracing import jit_inline
 
 
 def parameter(default: float, what: str):
@@ -60,10 +61,10 @@ _accelerate = one_by_one(lambda acceleration, *equations: acceleration(*equation
 _right_inverse = one_by_one(lambda correction, mass, jacobian: correction.right_inverse(mass, jacobian))
 
 
-def _in_units(at: Coefficients):
+def _in_units(at: LinearSystem):
     """M and J for speeds in radians and lengths of the mechanism."""
-    units = at.configuration.system.units
-    return at.mass * units[:, None] * units, at.jacobian * units
+    scales = at.configuration.system.scales
+    return at.mass * scales[:, None] * scales, at.jacobian * scales
 
 
 class ClassicalFormulation(AbstractFormulation):
@@ -98,7 +99,7 @@ class ClassicalFormulation(AbstractFormulation):
         whole_number(self.sweeps, "sweeps of ClassicalFormulation")
 
     @property
-    def nearest(self):
+    def distance_floor(self):
         """Distances are not measured, and count as one."""
         return 1.0
 
@@ -106,35 +107,35 @@ class ClassicalFormulation(AbstractFormulation):
     def moves_after_steps(self) -> bool:
         return self.correction is not None
 
-    def _solved(self, at: Coefficients, v) -> Dynamics:
+    def _solved(self, at: LinearSystem, v) -> Dynamics:
         """v̇ and λ, and what v̇ violates of the rows without stabilisation."""
         system, motion = at.configuration.system, move(at.configuration, v)
-        force, right, units = generalised_force(motion), gamma(motion), system.units
+        force, right, scales = generalised_force(motion), gamma(motion), system.scales
         mass, rows = _in_units(at)
         if system.topology.num_rows == 0:
-            return Dynamics(units * _solve(mass, units * force), right, right)
+            return Dynamics(scales * _solve(mass, scales * force), right, right)
         open_, rate_open = residual(at.configuration), at.jacobian @ v - rate(system, at.configuration.t)
         alpha, beta = self.stabilisation.alpha, self.stabilisation.beta
         stabilised = right - 2.0 * alpha * rate_open - beta**2 * open_
-        acceleration, multipliers = _accelerate(self.acceleration, mass, rows, units * force, stabilised)
-        acceleration = units * acceleration
+        acceleration, multipliers = _accelerate(self.acceleration, mass, rows, scales * force, stabilised)
+        acceleration = scales * acceleration
         return Dynamics(acceleration, multipliers, at.jacobian @ acceleration - right)
 
-    @traced_once
+    @jit_inline
     def derivative(self, system: System, t, q, v, correct):
         q = on_manifold(system.topology, q)
-        solved = self._solved(coefficients(system, t, q), v)
+        solved = self._solved(linear_system(system, t, q), v)
         return v, solved.acceleration, q, jnp.ones((), q.dtype)
 
-    @traced_once
+    @jit_inline
     def correct(self, system: System, t, q, v, errors=()):
         q, one = on_manifold(system.topology, q), jnp.ones((), q.dtype)
         if self.correction is None or system.topology.num_rows == 0:
             return q, v, errors, one
 
         def inverse(q):
-            at = coefficients(system, t, q)
-            return at, system.units[:, None] * _right_inverse(self.correction, *_in_units(at))
+            at = linear_system(system, t, q)
+            return at, system.scales[:, None] * _right_inverse(self.correction, *_in_units(at))
 
         def closer(_, q):
             at, back = inverse(q)
@@ -150,4 +151,4 @@ class ClassicalFormulation(AbstractFormulation):
         return q, v
 
     def dynamics(self, system: System, t, q, v) -> Dynamics:
-        return self._solved(coefficients(system, t, q), v)
+        return self._solved(linear_system(system, t, q), v)

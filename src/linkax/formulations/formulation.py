@@ -10,14 +10,14 @@ from linkax.equations.configuration import Configuration, configure
 from linkax.equations.dynamics import mass_entries
 from linkax.equations.loops import jacobian_entries
 from linkax.equations.system import System
-from linkax.linalg.chained_inverse import Blocks, in_cells
-from linkax.tracing import traced_once
+from linkax.linalg.block_elimination import Blocks, in_fronts
+from linkax.xla.tracing import jit_inline
 
 
-class Coefficients(NamedTuple):
+class LinearSystem(NamedTuple):
     """J and M of M v̇ = f + Jᵀλ, J v̇ = γ at a configuration.
 
-    - `blocks`: what the cells of the mechanism's chain have of both, where it has one.
+    - `blocks`: the entries of both by front, where the mechanism has an elimination plan.
     """
 
     configuration: Configuration
@@ -26,19 +26,19 @@ class Coefficients(NamedTuple):
     blocks: Blocks | None
 
 
-@traced_once
-def coefficients(system: System, t, q) -> Coefficients:
-    """Loop rows and mass matrix at coordinates q."""
+@jit_inline
+def linear_system(system: System, t, q) -> LinearSystem:
+    """Compute J and M at coordinates q."""
     configuration = configure(system, t, q)
-    rows, mass, chain = jacobian_entries(configuration), mass_entries(configuration), system.topology.chain
+    rows, mass, plan = jacobian_entries(configuration), mass_entries(configuration), system.structure.elimination
     # XLA leaves out what is not used.
-    return Coefficients(
-        configuration, rows.dense(), mass.dense(), None if chain is None else in_cells(chain, mass, rows)
+    return LinearSystem(
+        configuration, rows.dense(), mass.dense(), None if plan is None else in_fronts(plan, mass, rows)
     )
 
 
 class Dynamics(NamedTuple):
-    """What holds at a state.
+    """Accelerations and multipliers at a state.
 
     - `acceleration`: v̇, (n_v,). `multipliers`: λ, (m,). `violation`: J v̇ − γ, (m,).
     """
@@ -54,19 +54,23 @@ class AbstractFormulation(eqx.Module):
     Pure functions of (system, t, q, v); see `linkax.TangentSpace` and `linkax.ClassicalFormulation`.
     """
 
+    def prepared(self, dtype, rank_nearby=None) -> "AbstractFormulation":
+        """The same formulation for a floating-point type, and for the ranks of J along the motion, if it uses them."""
+        return self
+
     @property
     @abc.abstractmethod
-    def nearest(self):
-        """The distance from a singular configuration below which rounding grows no more."""
+    def distance_floor(self):
+        """The distance d from a singular configuration below which rounding grows no more."""
 
     @property
     @abc.abstractmethod
     def moves_after_steps(self) -> bool:
-        """Whether `correct` moves states to where the derivative is another one than before."""
+        """Whether `correct` moves a state to where its derivative is another one."""
 
     @abc.abstractmethod
     def derivative(self, system: System, t, q, v, correct):
-        """v, v̇, the coordinates that they hold at, and the distance d from the nearest singular configuration.
+        """Compute (v, v̇, q, d): speeds, accelerations, where they hold, and the distance from a singular configuration.
 
         `correct`: put the state on the loops before the equations of motion are formed; False, or a bool array. d is
         one where the formulation does not measure it.
@@ -74,12 +78,12 @@ class AbstractFormulation(eqx.Module):
 
     @abc.abstractmethod
     def correct(self, system: System, t, q, v, errors=()):
-        """The state after a step, as the next step begins with it, what remains of `errors` in it, and d."""
+        """Correct the state after a step: (q, v, what remains of `errors` in it, d)."""
 
     @abc.abstractmethod
     def close(self, system: System, t, q, v):
-        """q and v as they are saved and read."""
+        """Compute q and v as they are saved and read."""
 
     @abc.abstractmethod
     def dynamics(self, system: System, t, q, v) -> Dynamics:
-        """Accelerations and multipliers at a saved state."""
+        """Compute accelerations and multipliers at a saved state."""

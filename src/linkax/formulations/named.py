@@ -9,6 +9,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.lagrange_multipliers import LagrangeMultipliers
 from linkax.formulations.moore_penrose import MassOrthogonalProjection, MoorePenrose
 from linkax.formulations.projection_operator import ProjectionOperator
+from linkax.formulations.tangent_space import TangentSpace
 
 TANGENT_SPACE = "tangent-space"
 
@@ -28,16 +29,16 @@ ADDITIONS = {
 }
 
 
-def formulation(name: str) -> AbstractFormulation | None:
+def formulation(name: str) -> AbstractFormulation:
     """The formulation of that name: one of `BASES`, then "+baumgarte", and "+partitioning" or "+projection".
 
-    None for "tangent-space", the paper's method, whose numbers are those of `linkax.Accuracy`.
+    "tangent-space" is the paper's method, `linkax.TangentSpace()`.
 
     **Raises:** `ValueError` naming the known words.
     """
     base, *additions = name.split("+")
     if name == TANGENT_SPACE:
-        return None
+        return TangentSpace()
     added = {ADDITIONS[word][0]: ADDITIONS[word][1] for word in additions if word in ADDITIONS}
     twice = base == "augmented-lagrangian" and "baumgarte" in additions
     if base not in BASES or len(added) < len(additions) or twice:

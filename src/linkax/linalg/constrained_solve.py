@@ -16,13 +16,14 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from linkax.linalg.pivoted_qr import pivoted_qr
-from linkax.linalg.placing import assembled
+from linkax.linalg.static_sparse import assembled
 from linkax.linalg.triangular import cholesky_inverse, cholesky_inverse_by_elimination, upper_inverse
 from linkax.spatial.vectors import length
-from linkax.tracing import traced_once
+from linkax.xla.derivatives import ratio
+from linkax.xla.tracing import jit_inline
 
 
-class Inverse(NamedTuple):
+class SaddleInverse(NamedTuple):
     """The inverse of [[W, -Jᵀ], [J, 0]] on the independent rows of J.
 
     - `tangent` T (n, n), `normal` G (n, m), `compliance` S (m, m).
@@ -60,8 +61,8 @@ class SaddlePoint(eqx.Module):
         return jnp.concatenate([self.mass @ a - self.jacobian.T @ multipliers, self.jacobian @ a])
 
 
-@traced_once
-def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
+@jit_inline
+def invert(weight, jacobian, scales, tolerance, rank_nearby=None) -> SaddleInverse:
     """Split the space of speeds by J and invert the saddle-point system on it.
 
     **Arguments:**
@@ -69,23 +70,23 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     - `weight`: M for the mass metric, positive definite on the tangent space, (n, n); or None
       for the identity metric, which measures speeds by their units.
     - `jacobian`: J, (m, n), of any rank, redundant and zero rows included.
-    - `units`: one unit of each speed, (n,), so that radians and metres compare.
+    - `scales`: one unit of each speed, (n,), so that radians and metres compare.
     - `tolerance`: τ; a row is independent where |R_kk| > τ max(|R₁₁|, 1).
     - `rank_nearby`: the rank at the states around, where it is known; it is larger than the rank
       of a J that is singular. No more rows than that are taken for independent: off the loops,
       rows that the loops make dependent differ by as much as the loops are open.
     """
-    weight, jacobian, units = lax.stop_gradient((weight, jacobian, units))
+    weight, jacobian, scales = lax.stop_gradient((weight, jacobian, scales))
     rows, n = jacobian.shape
-    dtype, jacobian = jacobian.dtype, jacobian * units[None, :]
+    dtype, jacobian = jacobian.dtype, jacobian * scales[None, :]
     added = jnp.zeros(rows, dtype)
     to_metric, definiteness = jnp.eye(n, dtype=dtype), jnp.ones((), dtype)
     if weight is not None:
-        metric, added = _metric(weight, jacobian, units, tolerance)
+        metric, added = _metric(weight, jacobian, scales, tolerance)
         to_metric, definiteness = _lower_inverse(metric)
     if rows == 0:
-        tangent, nothing = to_metric.T * units[:, None], jnp.zeros((n, 0), dtype)
-        return Inverse(
+        tangent, nothing = to_metric.T * scales[:, None], jnp.zeros((n, 0), dtype)
+        return SaddleInverse(
             tangent @ tangent.T, nothing, nothing[:0], tangent, jnp.zeros((), int), jnp.ones((), dtype), definiteness
         )
 
@@ -99,10 +100,10 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     chosen = order[:count]
     on_rows = jnp.where(active[:, None], upper_inverse(triangle), 0.0) * scale[chosen][:, None]
     rows_inverse = (jnp.arange(rows)[:, None] == chosen).astype(dtype) @ on_rows
-    basis = units[:, None] * (to_metric.T @ q)
+    basis = scales[:, None] * (to_metric.T @ q)
     is_normal = jnp.zeros(n, bool).at[:count].set(active)
     tangent = jnp.where(is_normal, 0.0, basis)
-    return Inverse(
+    return SaddleInverse(
         tangent=tangent @ tangent.T,
         normal=jnp.where(is_normal, basis, 0.0)[:, :count] @ rows_inverse.T,
         compliance=rows_inverse @ rows_inverse.T - jnp.diag(added),
@@ -113,9 +114,9 @@ def invert(weight, jacobian, units, tolerance, rank_nearby=None) -> Inverse:
     )
 
 
-def _metric(weight, jacobian, units, tolerance):
+def _metric(weight, jacobian, scales, tolerance):
     """W = M + JᵀDJ in units, positive definite where M is so on the tangent space only, and the diagonal of D."""
-    weight, size = weight * units[:, None] * units[None, :], length(jacobian)
+    weight, size = weight * scales[:, None] * scales[None, :], length(jacobian)
     # A row of rounding alone would add as much as any other, and is left out.
     square = jnp.where(size > tolerance * jnp.maximum(jnp.max(size, initial=0.0), 1.0), size**4, 0.0)
     moved = jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1)
@@ -148,19 +149,19 @@ def independent(r, tolerance, rank_nearby, largest=None):
     return active, jnp.where(last >= 0, ratio(smallest, largest, 0.0), 1.0)
 
 
-def singularity_distance(weight, jacobian, units, tolerance, islands, rank_nearby=None) -> Float[Array, ""]:
+def singularity_distance(weight, jacobian, scales, tolerance, islands, rank_nearby=None) -> Float[Array, ""]:
     """`Inverse.distance` of `invert_apart`, with derivatives, where the pivots stay the same; none where it is zero."""
-    each = _over_islands(_distance, weight, jacobian, units, tolerance, islands, rank_nearby)
+    each = _over_islands(_distance, weight, jacobian, scales, tolerance, islands, rank_nearby)
     return jnp.min(jnp.concatenate([jnp.ones(1, jacobian.dtype), *(found for *_, found in each)]))
 
 
-def _distance(weight, jacobian, units, tolerance, rank_nearby):
-    (rows, n), jacobian = jacobian.shape, jacobian * units[None, :]
+def _distance(weight, jacobian, scales, tolerance, rank_nearby):
+    (rows, n), jacobian = jacobian.shape, jacobian * scales[None, :]
     if rows == 0:
         return jnp.ones((), jacobian.dtype)
     to_metric = jnp.eye(n, dtype=jacobian.dtype)
     if weight is not None:
-        to_metric, _ = cholesky_inverse_by_elimination(_metric(weight, jacobian, units, tolerance)[0])
+        to_metric, _ = cholesky_inverse_by_elimination(_metric(weight, jacobian, scales, tolerance)[0])
     weighted, _ = _scaled(to_metric, jacobian)
     _, r, order = pivoted_qr(lax.stop_gradient(weighted))
     active, found = independent(r, tolerance, rank_nearby)
@@ -179,7 +180,7 @@ def _distance(weight, jacobian, units, tolerance, rank_nearby):
     return jnp.where(is_known, sizes[last] / sizes[0], found)
 
 
-def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) -> Inverse:
+def invert_apart(weight, jacobian, scales, tolerance, islands, rank_nearby=None) -> SaddleInverse:
     """Like `invert`, for a system that falls apart: each island (rows, columns) by itself.
 
     Islands of one shape are inverted together, in one batch. `rank_nearby` is given, and `rank`
@@ -187,14 +188,14 @@ def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) 
     """
     (m, n), dtype = jacobian.shape, jacobian.dtype
     if len(islands) == 1:
-        found = invert(weight, jacobian, units, tolerance, None if rank_nearby is None else rank_nearby[0])
+        found = invert(weight, jacobian, scales, tolerance, None if rank_nearby is None else rank_nearby[0])
         return found._replace(rank=found.rank[None])
-    groups = list(_over_islands(invert, weight, jacobian, units, tolerance, islands, rank_nearby))
+    groups = list(_over_islands(invert, weight, jacobian, scales, tolerance, islands, rank_nearby))
     of_all = lambda part: jnp.concatenate([getattr(found, part) for *_, found in groups])
     together = lambda shape, parts: assembled(
         shape, [((down[:, :, None], across[:, None, :]), block) for down, across, block in parts], dtype
     )
-    return Inverse(
+    return SaddleInverse(
         tangent=together((n, n), [(columns, columns, found.tangent) for _, _, columns, found in groups]),
         normal=together((n, m), [(columns, rows, found.normal) for _, rows, columns, found in groups]),
         compliance=together((m, m), [(rows, rows, found.compliance) for _, rows, _, found in groups]),
@@ -205,7 +206,7 @@ def invert_apart(weight, jacobian, units, tolerance, islands, rank_nearby=None) 
     )
 
 
-def _over_islands(function, weight, jacobian, units, tolerance, islands, rank_nearby):
+def _over_islands(function, weight, jacobian, scales, tolerance, islands, rank_nearby):
     """A function of each island, of those of one shape together: their places, rows and columns, and what it gives."""
     groups = {}
     for index, (rows, columns) in enumerate(islands):
@@ -215,12 +216,12 @@ def _over_islands(function, weight, jacobian, units, tolerance, islands, rank_ne
         across, down, up = columns[:, None, :], columns[:, :, None], rows[:, :, None]
         blocks = None if weight is None else weight[down, across]
         ranks = None if rank_nearby is None else rank_nearby[index]
-        inputs = blocks, jacobian[up, across], units[columns], tolerance, ranks
+        inputs = blocks, jacobian[up, across], scales[columns], tolerance, ranks
         axes = [None if blocks is None else 0, 0, 0, None, None if ranks is None else 0]
         yield index, rows, columns, jax.vmap(function, in_axes=axes)(*inputs)
 
 
-def with_mass(inverse: Inverse, mass) -> Inverse:
+def with_mass(inverse: SaddleInverse, mass) -> SaddleInverse:
     """The inverse for another mass matrix on the same split: M needs to be definite on T alone."""
     mass = lax.stop_gradient(mass)
     basis = inverse.basis
@@ -235,10 +236,6 @@ def with_mass(inverse: Inverse, mass) -> Inverse:
     return inverse._replace(tangent=tangent, normal=normal, compliance=compliance, definiteness=definiteness)
 
 
-def ratio(a, b, otherwise):
-    return jnp.where(b > 0.0, a / jnp.where(b > 0.0, b, 1.0), otherwise)
-
-
 def _lower_inverse(matrix):
     """L⁻¹ of a positive definite matrix L Lᵀ, and its definiteness (see `Inverse`)."""
     inverse, diagonal = cholesky_inverse(matrix)
@@ -248,11 +245,11 @@ def _lower_inverse(matrix):
     return inverse, jnp.min(ratio(diagonal**2, own, 0.0), initial=1.0)
 
 
-@traced_once
-def constrained_solve(inverse, mass, jacobian, f, gamma, sweeps: int = 1, product=None):
+@jit_inline
+def constrained_solve(inverse, mass, jacobian, f, gamma, refinements: int = 1, product=None):
     """Solve M a = f + Jᵀλ, J a = γ, differentiably in M, J, f and γ, in both modes, to any order.
 
-    `inverse` is that of a system nearby, or of this one; each sweep of iterative refinement
+    `inverse` is that of a system nearby, or of this one; each step of iterative refinement
     multiplies the error by the distance between the two. Derivatives are solves of the same
     system with the right-hand sides df − dM a + dJᵀλ and dγ − dJ a; nothing is differentiated
     through the pivoting. They hold where the rank of J does not change. `product`: with the system's matrix, where
@@ -271,7 +268,7 @@ def constrained_solve(inverse, mass, jacobian, f, gamma, sweeps: int = 1, produc
 
     def solve(_, right):
         unknowns = nearby(right)
-        for _ in range(sweeps):
+        for _ in range(refinements):
             unknowns = unknowns + nearby(right - product(unknowns))
         return unknowns
 
@@ -295,13 +292,13 @@ class LeastMultipliers(NamedTuple):
     free: Float[Array, "m m"]
 
 
-def least_multipliers(jacobian, multipliers, units, tolerance, rank) -> LeastMultipliers:
+def least_multipliers(jacobian, multipliers, scales, tolerance, rank) -> LeastMultipliers:
     """Of all multipliers with the same Jᵀλ those of minimum norm, differentiable like `constrained_solve`.
 
-    They solve λ = J y, Jᵀλ = given, a constrained solve too. `units`, `tolerance`: see `invert`;
+    They solve λ = J y, Jᵀλ = given, a constrained solve too. `scales`, `tolerance`: see `invert`;
     `rank`: of J.
     """
-    transposed, size = (jacobian * units).T, multipliers.shape[0]
+    transposed, size = (jacobian * scales).T, multipliers.shape[0]
     one = jnp.ones(size, multipliers.dtype)
     inverse = invert(None, transposed, one, tolerance, rank)
     given = transposed @ multipliers

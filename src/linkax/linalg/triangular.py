@@ -3,17 +3,12 @@
 A batch of small matrices spends its time in calling LAPACK. Larger ones are given to it one by one.
 """
 
-import math
-
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from linkax.tracing import one_by_one
-
-SMALL = 32  # rows, up to which elimination serves batches
+from linkax.xla.batches import small_in_batches
 
 
 def cholesky_inverse(matrix: Float[Array, "n n"]):
@@ -68,25 +63,5 @@ def _upper_by_elimination(triangle):
     return work[:, n:]
 
 
-def _for_batches(single, batched):
-    """A function of a matrix, computed in another way in batches of small ones."""
-
-    @jax.custom_batching.custom_vmap
-    def function(matrix):
-        outer, shape = matrix.shape[:-2], matrix.shape[-2:]
-        if not outer:
-            return (batched if shape[0] <= SMALL else single)(matrix)
-        mapped = jax.vmap(batched if shape[0] <= SMALL else one_by_one(single))
-        found = mapped(matrix.reshape(math.prod(outer), *shape))
-        return jax.tree.map(lambda part: part.reshape(*outer, *part.shape[1:]), found)
-
-    @function.def_vmap
-    def _(_size, _batched, matrix):
-        found = function(matrix)
-        return found, jax.tree.map(lambda _: True, found)
-
-    return function
-
-
-_cholesky_inverse = _for_batches(_by_lapack, cholesky_inverse_by_elimination)
-_upper_inverse = _for_batches(_upper_by_lapack, _upper_by_elimination)
+_cholesky_inverse = small_in_batches(_by_lapack, cholesky_inverse_by_elimination)
+_upper_inverse = small_in_batches(_upper_by_lapack, _upper_by_elimination)

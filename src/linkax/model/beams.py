@@ -21,20 +21,20 @@ from linkax.model.forces import AbstractForce, Load
 from linkax.model.joints.bending import MASS_PLACES, NUM_STRAINS, BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import (
-    flag,
-    instance,
-    known,
     number,
     one_of,
     positive,
     real,
     require,
+    require_bool,
+    require_type,
     rotation_matrix,
     whole_number,
     zero_or_more,
 )
 from linkax.model.sections import Section
 from linkax.model.terms import Term
+from linkax.xla.tracing import concrete
 
 # What a section needs against each component of strain.
 STIFFNESSES = ("torsional_stiffness", *2 * ("bending_stiffness",), "axial_stiffness", *2 * ("shear_stiffness",))
@@ -90,10 +90,10 @@ class Beam(AbstractBody):
         what = f"beam {name!r}"
         self.length = positive(length, f"{what}: length [m]")
         sections = "give a lx.Section, lx.rectangle(...) or lx.circle(...)"
-        self.section = instance(section, Section, f"{what}: section", sections)
+        self.section = require_type(section, Section, f"{what}: section", sections)
         self.elements = whole_number(elements, f"{what}: elements")
         flags = {"torsion": torsion, "stretch": stretch, "shear": shear}
-        torsion, stretch, shear = (flag(entry, f"{what}: {name}") for name, entry in flags.items())
+        torsion, stretch, shear = (require_bool(entry, f"{what}: {name}") for name, entry in flags.items())
         one_of(bends, ("yz", "y", "z", ""), f"{what}: bends")
         asked = [torsion, "y" in bends, "z" in bends, stretch, shear and "z" in bends, shear and "y" in bends]
         self.strains = tuple(np.flatnonzero(asked).tolist())
@@ -131,7 +131,7 @@ class Beam(AbstractBody):
         if element is not None:
             whole_number(element, f"{what}: element", least=0, most=self.elements - 1)
             return Place(self.name, self.within(offset, what, element, element + 1), axes, int(element))
-        along = known(offset[0] / self.element_length)
+        along = concrete(offset[0] / self.element_length)
         if along is None:
             raise ValueError(f"{what} is traced by JAX; say which element it is in: beam.at(..., element=0)")
         element = int(np.clip(np.floor(along), 0, self.elements - 1))
@@ -293,7 +293,7 @@ class Parts(NamedTuple):
     constraints: list[AbstractConstraint]
 
 
-def taken_apart(bodies, joints, forces, constraints) -> Parts:
+def discretise_beams(bodies, joints, forces, constraints) -> Parts:
     """Beams as sections, joints and forces, where they are not yet; places on them, and sleeves, as massless bodies."""
     names = {body.name for body in bodies}
     beams = {body.name: body for body in bodies if isinstance(body, Beam) and body.nodes[0] not in names}

@@ -10,16 +10,16 @@ from jaxtyping import Array, Float
 
 from linkax.model.numbers import (
     Constant,
-    instance,
-    known,
     namespace,
     number,
     positive,
     require,
+    require_type,
     rotation_matrix,
     value,
     zero_or_more,
 )
+from linkax.xla.tracing import concrete
 
 GROUND_NAME = "ground"
 
@@ -97,7 +97,7 @@ class RigidBody(AbstractBody):
         self.center_of_mass = number(center_of_mass, (3,), f"body {name!r}: center_of_mass [m]")
         self.inertia = inertia_tensor(inertia, f"body {name!r}: inertia [kg m²]")
         frames = {} if frames is None else frames
-        instance(frames, Mapping, f"body {name!r}: frames", 'give {"tip": [x, y, z]}')
+        require_type(frames, Mapping, f"body {name!r}: frames", 'give {"tip": [x, y, z]}')
         self.frames = {
             self._label(label): number(offset, (3,), f"body {name!r}: frame {label!r} [m]")
             for label, offset in frames.items()
@@ -165,7 +165,7 @@ def inertia_tensor(inertia, what):
         tensor = tensor * np.eye(3)
     tensor = require(tensor, _is_symmetric, what, "it must be symmetric")
     moments = _principal_moments(tensor, diagonal)
-    sizes = "" if known(moments) is None else f" {moments.tolist()}"
+    sizes = "" if concrete(moments) is None else f" {moments.tolist()}"
     remedy = (
         f"no body has it: its principal moments{sizes} must not be negative, and the largest must not exceed the sum "
         "of the others (triangle inequality); check units, and that it is taken about the centre of mass"

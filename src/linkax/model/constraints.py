@@ -20,7 +20,7 @@ class AbstractConstraint(AbstractElement):
     name: str = eqx.field(static=True)
 
     @property
-    def described(self):
+    def display_name(self):
         return f"{type(self).__name__.lower()} {self.name!r}"
 
     @property

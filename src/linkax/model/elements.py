@@ -28,5 +28,5 @@ class AbstractElement(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def described(self) -> str:
+    def display_name(self) -> str:
         """What errors call it."""

@@ -58,7 +58,7 @@ class AbstractForce(AbstractElement):
         return False
 
     @property
-    def described(self):
+    def display_name(self):
         return _described(type(self).__name__, [repr(name) for name in self.joints] or _named(self.frames))
 
     @abc.abstractmethod
@@ -81,9 +81,11 @@ class AbstractForce(AbstractElement):
         try:
             found = self.switch(t, motion)
         except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
-            raise ValueError(f"{self.described}: its switch raises {raised(error)}") from error
+            raise ValueError(f"{self.display_name}: its switch raises {raised(error)}") from error
         if not isinstance(found, jax.Array) or found.shape != () or not jnp.issubdtype(found.dtype, jnp.floating):
-            raise ValueError(f"{self.described}: its switch is {found!r}; give one number that depends on the motion")
+            raise ValueError(
+                f"{self.display_name}: its switch is {found!r}; give one number that depends on the motion"
+            )
         return found
 
     def applied(self, t, motion, on=None) -> Load:
@@ -94,16 +96,16 @@ class AbstractForce(AbstractElement):
         try:
             found = self.load(t, motion, *side)
         except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
-            raise ValueError(f"{self.described}: its load raises {raised(error)}") from error
+            raise ValueError(f"{self.display_name}: its load raises {raised(error)}") from error
         whole = Load.none(motion.system)
         if not isinstance(found, Load):
-            raise ValueError(f"{self.described}: its load is {found!r}; {GIVE_LOAD}")
+            raise ValueError(f"{self.display_name}: its load is {found!r}; {GIVE_LOAD}")
         for name, part, right in zip(Load._fields, found, whole, strict=True):
             shape, dtype = jnp.shape(part), jnp.result_type(part)
             if shape != right.shape or not jnp.issubdtype(dtype, jnp.floating):
                 raise ValueError(
-                    f"{self.described}: {name} of its load has shape {shape} and type {dtype}, not {right.shape} and "
-                    f"{right.dtype}; {GIVE_LOAD}"
+                    f"{self.display_name}: {name} of its load has shape {shape} and type {dtype}, not {right.shape} "
+                    f"and {right.dtype}; {GIVE_LOAD}"
                 )
         return found
 
@@ -283,8 +285,8 @@ class Spring(_BetweenPoints):
 
     def __init__(self, first, second, stiffness, free_length=0.0):
         self.first, self.second = _frames("Spring", first, second)
-        self.stiffness = number(stiffness, (), f"{self.described}: stiffness [N/m]")
-        self.free_length = zero_or_more(free_length, f"{self.described}: free_length [m]")
+        self.stiffness = number(stiffness, (), f"{self.display_name}: stiffness [N/m]")
+        self.free_length = zero_or_more(free_length, f"{self.display_name}: free_length [m]")
 
     def pull(self, motion):
         along = motion.configuration.between(self.first, self.second)
@@ -306,7 +308,7 @@ class Damper(_BetweenPoints):
 
     def __init__(self, first, second, damping):
         self.first, self.second = _frames("Damper", first, second)
-        self.damping = number(damping, (), f"{self.described}: damping [N s/m]")
+        self.damping = number(damping, (), f"{self.display_name}: damping [N s/m]")
 
     def pull(self, motion):
         direction = _unit(motion.configuration.between(self.first, self.second))
@@ -323,8 +325,10 @@ class _OnPoint(AbstractForce):
     def __init__(self, point, axes):
         self.point = frame_of(point, f"{type(self).__name__}: point")
         if self.point.body == GROUND_NAME:
-            raise ValueError(f"{self.described}: point is {point!r}, which nothing moves; give a point of another body")
-        self.axes = one_of(axes, ("ground", "frame"), f"{self.described}: axes")
+            raise ValueError(
+                f"{self.display_name}: point is {point!r}, which nothing moves; give a point of another body"
+            )
+        self.axes = one_of(axes, ("ground", "frame"), f"{self.display_name}: axes")
 
     @property
     def frames(self):
@@ -349,7 +353,7 @@ class PointForce(_OnPoint):
 
     def __init__(self, point, force, axes="ground"):
         super().__init__(point, axes)
-        self.force = number_or_law(force, (3,), f"{self.described}: force [N]")
+        self.force = number_or_law(force, (3,), f"{self.display_name}: force [N]")
 
     def load(self, t, motion):
         return motion.point_load(self.point, self._in_ground_axes(self.force, t, motion))
@@ -365,7 +369,7 @@ class PointMoment(_OnPoint):
 
     def __init__(self, point, moment, axes="ground"):
         super().__init__(point, axes)
-        self.moment = number_or_law(moment, (3,), f"{self.described}: moment [N m]")
+        self.moment = number_or_law(moment, (3,), f"{self.display_name}: moment [N m]")
 
     def load(self, t, motion):
         nothing = jnp.zeros(3, motion.system.dtype)

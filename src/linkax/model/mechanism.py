@@ -4,7 +4,7 @@ from collections import Counter
 
 import equinox as eqx
 
-from linkax.model.beams import Beam, held_first, taken_apart
+from linkax.model.beams import Beam, discretise_beams, held_first
 from linkax.model.bodies import GROUND_NAME, RigidBody
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
@@ -12,7 +12,7 @@ from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
-from linkax.model.numbers import flag, listed
+from linkax.model.numbers import listed, require_bool
 from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
 
 
@@ -56,7 +56,7 @@ class Mechanism(eqx.Module):
             raise ValueError("bodies is empty, []; give at least one body")
         forces = listed(forces, AbstractForce, "forces", "give a list of Gravity, Spring and their like")
         beams = [body for body in bodies if isinstance(body, Beam)]
-        bodies, joints, forces, constraints = taken_apart(bodies, joints, forces, constraints)
+        bodies, joints, forces, constraints = discretise_beams(bodies, joints, forces, constraints)
         by_name, joint_by_name = _by_name(bodies, "body"), _by_name(joints, "joint")
         _by_name([*joints, *constraints], "joint or constraint")
         _check_references(by_name, joint_by_name, constraints, forces)
@@ -89,8 +89,8 @@ class Mechanism(eqx.Module):
             parent=tuple(index[joint.parent.body] for joint in self.joints),
             child=tuple(index[joint.child.body] for joint in self.joints),
             joint_types=tuple(joint.kind for joint in self.joints),
-            movers=tuple(joint.movers for joint in self.joints),
-            **split_rows(carriers, predecessors, cuts, flag(all_rows, "all_rows")),
+            driven_by=tuple(joint.driven_by for joint in self.joints),
+            **split_rows(carriers, predecessors, cuts, require_bool(all_rows, "all_rows")),
             constraints=tuple(constraint.name for constraint in constraints),
             constraint_terms=tuple(constraint.terms for constraint in constraints),
             constraint_bodies=tuple(tuple(index[f.body] for f in constraint.frames) for constraint in constraints),
@@ -137,15 +137,15 @@ def _check_references(bodies, joints, constraints, forces):
     for joint in joints.values():
         check_frames(f"joint {joint.name!r}", (joint.parent, joint.child))
     for force in forces:
-        check_frames(force.described, force.frames)
+        check_frames(force.display_name, force.frames)
         for name, index in force.terms:
-            check_joint(force.described, name)
-            _check_index(force.described, joints[name], index, force.needs_coordinate)
+            check_joint(force.display_name, name)
+            _check_index(force.display_name, joints[name], index, force.needs_coordinate)
     for constraint in constraints:
-        check_frames(constraint.described, constraint.frames)
+        check_frames(constraint.display_name, constraint.frames)
         for name, index in constraint.terms:
-            check_joint(constraint.described, name)
-            _check_index(constraint.described, joints[name], index, True)
+            check_joint(constraint.display_name, name)
+            _check_index(constraint.display_name, joints[name], index, True)
 
 
 def _check_index(what, joint, index, needs_coordinate):

@@ -38,14 +38,14 @@ def value(entry):
     return entry.array if isinstance(entry, Constant) else entry
 
 
-def known(number) -> np.ndarray | None:
+def concrete(number) -> np.ndarray | None:
     """The number as a NumPy array, or None while it is traced by a transformation."""
     return None if isinstance(number, jax.core.Tracer) else np.asarray(number)
 
 
 def namespace(*arrays):
     """NumPy for arrays whose values are known, or jax.numpy where one is traced."""
-    return np if all(known(array) is not None for array in arrays) else jnp
+    return np if all(concrete(array) is not None for array in arrays) else jnp
 
 
 def number(entry, shape: tuple[int, ...], what: str):
@@ -59,8 +59,8 @@ def number(entry, shape: tuple[int, ...], what: str):
 
 def is_finite(array):
     """Whether all numbers of an array are."""
-    concrete = known(array)
-    return jnp.isfinite(array).all() if concrete is None else np.isfinite(concrete).all()
+    known = concrete(array)
+    return jnp.isfinite(array).all() if known is None else np.isfinite(known).all()
 
 
 def real(entry, what: str):
@@ -109,7 +109,7 @@ def whole_number(entry, what: str, least: int = 1, most: int = MOST) -> int:
     return int(entry)
 
 
-def flag(entry, what: str) -> bool:
+def require_bool(entry, what: str) -> bool:
     """True or False."""
     if not isinstance(entry, bool | np.bool_):
         raise ValueError(f"{what} is {entry!r}; give True or False")
@@ -123,7 +123,7 @@ def one_of(entry, choices: tuple[str, ...], what: str) -> str:
     return entry
 
 
-def instance(entry, kind, what: str, remedy: str):
+def require_type(entry, kind, what: str, remedy: str):
     """Something of a kind, or of one of several."""
     if not isinstance(entry, kind):
         raise ValueError(f"{what} is {entry!r}; {remedy}")
@@ -136,7 +136,7 @@ def listed(entries, kind, what: str, remedy: str) -> list:
         found = list(entries)
     except TypeError as error:
         raise ValueError(f"{what} is {entries!r}; {remedy}") from error
-    return [instance(entry, kind, f"an entry of {what}", remedy) for entry in found]
+    return [require_type(entry, kind, f"an entry of {what}", remedy) for entry in found]
 
 
 def require(array, condition, what: str, remedy: str):
@@ -145,12 +145,12 @@ def require(array, condition, what: str, remedy: str):
     Where the condition is known, it raises a ValueError if it fails; where it is traced, an array that fails it is
     NaN, which the result of a simulation tells.
     """
-    concrete = known(array)
-    met = condition(lax.stop_gradient(array) if concrete is None else concrete)
-    if known(met) is None:
+    known = concrete(array)
+    met = condition(lax.stop_gradient(array) if known is None else known)
+    if concrete(met) is None:
         return jnp.where(met, array, jnp.nan)
     if not met:
-        raise ValueError(f"{what} is {concrete.tolist()}; {remedy}")
+        raise ValueError(f"{what} is {known.tolist()}; {remedy}")
     return array
 
 
@@ -190,7 +190,7 @@ def perpendicular_axes(first, axis, what: str):
     """Two unit vectors, the first as `unit_axis` made it, the second from `axis` and checked to be at a right angle."""
     second = unit_axis(axis, what)
     one, other = value(first), value(second)
-    cosine = known(one @ other)
+    cosine = concrete(one @ other)
     angle = "" if cosine is None else f", at {np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))):.6g} degrees"
     remedy = f"it must be at a right angle to the first axis{angle}"
     checked = partial(require, condition=lambda _: abs(one @ other) <= 1e-12, what=what, remedy=remedy)

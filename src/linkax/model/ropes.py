@@ -131,9 +131,9 @@ class ElasticRope(AbstractForce):
 
     def __init__(self, points, stiffness, free_length, damping=0.0):
         self.points = _points(points, "ElasticRope")
-        self.stiffness = positive(stiffness, f"{self.described}: stiffness [N/m]")
-        self.free_length = positive(free_length, f"{self.described}: free_length [m]")
-        self.damping = zero_or_more(damping, f"{self.described}: damping [N s/m]")
+        self.stiffness = positive(stiffness, f"{self.display_name}: stiffness [N/m]")
+        self.free_length = positive(free_length, f"{self.display_name}: free_length [m]")
+        self.damping = zero_or_more(damping, f"{self.display_name}: damping [N s/m]")
 
     @property
     def frames(self):

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import instance, known, namespace, number, positive, real, require
+from linkax.model.numbers import namespace, number, positive, real, require, require_type
+from linkax.xla.tracing import concrete
 
 GIVE_MATERIAL = "give a lx.Material(youngs_modulus, poissons_ratio, density)"
 
@@ -126,7 +127,7 @@ def _of_profile(material, area, second_moments, torsion_constant, shear_coeffici
 def _wall(thickness, sizes, what):
     """The thickness of walls that fit into a profile of these sizes."""
     most = namespace(*sizes).stack(sizes).min() / 2.0
-    known_most = "" if known(most) is None else f", {float(most)}"
+    known_most = "" if concrete(most) is None else f", {float(most)}"
     remedy = f"it must be positive, and less than half of the profile{known_most}"
     return require(number(thickness, (), what), lambda metres: (metres > 0.0) & (metres < most), what, remedy)
 
@@ -141,7 +142,7 @@ def rectangle(width, height, material: Material, thickness=None) -> Section:
     **Raises:** `ValueError` for a size that is not positive, and for walls that do not fit.
     """
     width, height = positive(width, "rectangle: width [m]"), positive(height, "rectangle: height [m]")
-    instance(material, Material, "rectangle: material", GIVE_MATERIAL)
+    require_type(material, Material, "rectangle: material", GIVE_MATERIAL)
     ratio = material.poissons_ratio
     if thickness is None:
         long, short = jnp.maximum(width, height), jnp.minimum(width, height)
@@ -180,7 +181,7 @@ def circle(diameter, material: Material, thickness=None) -> Section:
     **Raises:** `ValueError` for a size that is not positive, and for walls that do not fit.
     """
     diameter = positive(diameter, "circle: diameter [m]")
-    instance(material, Material, "circle: material", GIVE_MATERIAL)
+    require_type(material, Material, "circle: material", GIVE_MATERIAL)
     inner = 0.0 * diameter
     if thickness is not None:
         inner = diameter - 2.0 * _wall(thickness, (diameter,), "circle: thickness [m]")

@@ -7,31 +7,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from linkax.linalg.chain import PER_CELL, Chain, chained
 from linkax.model.bodies import GROUND_NAME
-from linkax.model.joints.joint import AbstractJoint, JointKind, Motion
+from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
 from linkax.model.terms import Term
 
 GROUND_INDEX = -1
 
 
-class Island(NamedTuple):
-    """A part of a mechanism that moves independently of the rest: its loop rows and its speeds."""
-
-    rows: tuple[int, ...]
-    columns: tuple[int, ...]
-
-
-class Kind(NamedTuple):
+class JointGroup(NamedTuple):
     """Joints in the tree that move in the same way, by as many coordinates.
 
     - `motion`: the type of the joints, or their `motion` where it has one.
-    - `bodies`: those that they carry. `places`: where in q the coordinates lie that move each, (n, k).
+    - `bodies`: those that they carry. `coordinates`: where in q the coordinates lie that move each, (n, k).
     """
 
-    motion: type[AbstractJoint] | Motion
+    motion: type[AbstractJoint] | RelativeMotion
     bodies: tuple[int, ...]
-    places: np.ndarray
+    coordinates: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +36,7 @@ class Topology:
     - `predecessor`: the body that carries each body in the tree.
     - `parent`, `child`: bodies of each joint as it was declared.
     - `joint_types`: class of each joint, or what else says the same of it (see `AbstractJoint.kind`).
-    - `movers`: for each joint whose motion depends on other coordinates than its own, what they are
+    - `driven_by`: for each joint whose motion depends on other coordinates than its own, what they are
       coordinates of, its own among them; None for the rest.
     - `rotation_rows`: (cut joint, i, j) of each loop row h₁ⁱ·h₂ʲ, `translation_rows`:
       (cut joint, i) of each loop row h₁ⁱ·s; cut joints and axes counted from 0. Rows that
@@ -63,7 +55,7 @@ class Topology:
     parent: tuple[int, ...]
     child: tuple[int, ...]
     joint_types: tuple[type[AbstractJoint] | JointKind, ...]
-    movers: tuple[tuple[Term, ...] | None, ...]
+    driven_by: tuple[tuple[Term, ...] | None, ...]
     rotation_rows: tuple[tuple[int, int, int], ...]
     translation_rows: tuple[tuple[int, int], ...]
     immobile_rotation_rows: tuple[tuple[int, int, int], ...]
@@ -117,7 +109,7 @@ class Topology:
         """Where in v the speed of a term lies, of a joint in the tree."""
         return self.speeds[term.joint].start + (term.index or 0)
 
-    def places(self, term: Term) -> slice:
+    def coordinate_slice(self, term: Term) -> slice:
         """Where in q the coordinates of a term lie, of a joint in the tree."""
         taken = self.coordinates[term.joint]
         if term.index is None:
@@ -127,10 +119,10 @@ class Topology:
 
     def columns(self, body: int) -> np.ndarray:
         """Where in v the speeds lie that move a body on its predecessor."""
-        movers, taken = self.movers[body], self.speeds[self.joints[body]]
-        if movers is None:
+        driven_by, taken = self.driven_by[body], self.speeds[self.joints[body]]
+        if driven_by is None:
             return np.arange(taken.start, taken.stop)
-        return np.array([self.column(term) for term in movers], dtype=int)
+        return np.array([self.column(term) for term in driven_by], dtype=int)
 
     @cached_property
     def motions(self) -> np.ndarray:
@@ -177,19 +169,21 @@ class Topology:
         return np.stack([np.setdiff1d(q, in_q), np.setdiff1d(v, in_v)], axis=-1)
 
     @cached_property
-    def kinds(self) -> tuple["Kind", ...]:
+    def joint_groups(self) -> tuple["JointGroup", ...]:
         """The joints in the tree by what their motion is."""
         of_motion = {}
         for body, kind in enumerate(self.joint_types[: self.num_bodies]):
-            alike = (kind, None) if kind.motion is None else (kind.motion, len(self.movers[body]))
+            alike = (kind, None) if kind.motion is None else (kind.motion, len(self.driven_by[body]))
             of_motion.setdefault(alike, []).append(body)
-        return tuple(Kind(motion, tuple(bodies), self._read_by(bodies)) for (motion, _), bodies in of_motion.items())
+        return tuple(
+            JointGroup(motion, tuple(bodies), self._read_by(bodies)) for (motion, _), bodies in of_motion.items()
+        )
 
     def _read_by(self, bodies):
-        if self.movers[bodies[0]] is None:
+        if self.driven_by[bodies[0]] is None:
             taken = [self.coordinates[self.joints[body]] for body in bodies]
             return np.array([np.arange(places.start, places.stop) for places in taken], dtype=int)
-        places = [[self.places(term).start for term in self.movers[body]] for body in bodies]
+        places = [[self.coordinate_slice(term).start for term in self.driven_by[body]] for body in bodies]
         return np.array(places, dtype=int)
 
     @cached_property
@@ -217,35 +211,6 @@ class Topology:
     def coupled_by_inertia(self) -> tuple[np.ndarray, ...]:
         """Sets of speeds between which the mass matrix has entries: those on the way from ground to each body."""
         return tuple(self._moving(on_path) for on_path in self.path[:-1])
-
-    @cached_property
-    def islands(self) -> tuple["Island", ...]:
-        """Parts of the mechanism that neither a loop nor an inertia connects, in the order of their speeds."""
-        label = np.arange(self.num_speeds)
-        for together in (*self.coupled_by_inertia, *self.read_by_rows):
-            label[np.isin(label, label[together])] = np.min(label[together], initial=self.num_speeds)
-        row_label = np.array([label[columns[0]] if len(columns) else 0 for columns in self.read_by_rows], dtype=int)
-        return tuple(
-            Island(tuple(np.flatnonzero(row_label == part)), tuple(np.flatnonzero(label == part)))
-            for part in np.unique(label)
-        )
-
-    @cached_property
-    def chain(self) -> Chain | None:
-        """Cells in which the loops can be solved one after the other; None where all at once takes less."""
-        if self.num_rows == 0:
-            return None
-        at_once = sum(len(columns) ** 2 * (len(columns) + 2 * len(rows)) for rows, columns in self.islands)
-        if at_once <= PER_CELL:
-            return None
-        found = chained(self.read_by_rows, self.coupled_by_inertia, self.num_speeds)
-        return found if found.work < at_once else None
-
-    @cached_property
-    def cells_of_islands(self) -> np.ndarray:
-        """1 where a cell of the chain is part of an island, (islands, cells)."""
-        first = [min((*added, *kept)) for added, kept in zip(self.chain.added, self.chain.kept, strict=True)]
-        return np.array([np.isin(first, columns) for _, columns in self.islands])
 
     @cached_property
     def reversed(self) -> np.ndarray:

@@ -19,8 +19,8 @@ from linkax.model.joints.bending import OnBeam
 from linkax.model.mechanism import Mechanism
 from linkax.model.ropes import ElasticRope, Rope
 from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
-from linkax.simulation.instant import Pose
-from linkax.simulation.solution import Solution
+from linkax.simulation.read.observables import Pose
+from linkax.simulation.read.solution import Solution
 
 BODY_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 NEGLIGIBLE = 1e-9  # length of a direction seen from its end

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from linkax.plotting import animate_mechanism, plot_energy, plot_point_motion, plot_reaction, plot_violations
-from linkax.simulation.files import written_whole
-from linkax.simulation.solution import Solution
+from linkax.simulation.read.solution import Solution
+from linkax.studies.files import written_whole
 
 
 def write_pictures(solution: Solution, points, folder: Path) -> list[Path]:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import known
-from linkax.simulation.state import State
+from linkax.simulation.start.state import State
+from linkax.xla.tracing import concrete
 
 Parameters = Mapping[str, object]
 
@@ -110,7 +110,7 @@ def _count(entry) -> int:
 def _finite(entry):
     if isinstance(entry, bool):
         raise ValueError
-    if known(entry) is None or hasattr(entry, "dtype"):
+    if concrete(entry) is None or hasattr(entry, "dtype"):
         return entry
     if not math.isfinite(number := float(entry)):
         raise ValueError

@@ -1,1 +1,1 @@
-"""Assembly of consistent states, integration in time, and the solution."""
+"""From a state to a motion: `start`, `integrate`, `explain`, `read`, and `linkax.simulate` above them."""

@@ -15,16 +15,17 @@ from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import COMPARED
 from linkax.formulations.named import formulation as named
-from linkax.formulations.shared_program import in_shared_programs
+from linkax.formulations.switch import in_one_program
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import instance, number, require, whole_number
-from linkax.simulation.accuracy import Accuracy
-from linkax.simulation.diagnosis import cause
-from linkax.simulation.given import checked_state, checked_time
-from linkax.simulation.results import RESULTS, result_name
-from linkax.simulation.simulate import DEFAULT_SAVES, fixed_steps, simulate
-from linkax.simulation.solution import Solution
-from linkax.simulation.state import State
+from linkax.model.numbers import number, require, require_type, whole_number
+from linkax.simulation.explain.diagnosis import cause
+from linkax.simulation.integrate.accuracy import Accuracy
+from linkax.simulation.integrate.results import RESULTS, result_name
+from linkax.simulation.integrate.run import DEFAULT_FORMULATION, DEFAULT_SAVES
+from linkax.simulation.read.solution import Solution
+from linkax.simulation.simulate import fixed_steps, simulate
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import checked_state, checked_time
 
 TIGHTEST, NEXT_TO_IT = 1e-13, 1e-12  # tolerances of the reference and of its check
 DIVERGED = 1e-2  # of the mechanism's length
@@ -98,7 +99,7 @@ def compare(
     *,
     t1: float,
     steppings: Sequence[Stepping],
-    formulations: Mapping[str, AbstractFormulation | None] | Sequence[str] = COMPARED,
+    formulations: Mapping[str, AbstractFormulation] | Sequence[str] = COMPARED,
     exact: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None = None,
     bound: float | None = None,
     repeats: int = 3,
@@ -128,7 +129,7 @@ def compare(
     _check_asked(t1, steppings, formulations, bound, repeats)
     chosen = dict(formulations) if isinstance(formulations, Mapping) else {name: named(name) for name in formulations}
     classical = {name: entry for name, entry in chosen.items() if isinstance(entry, ClassicalFormulation)}
-    chosen |= dict(zip(classical, in_shared_programs(list(classical.values())), strict=True))
+    chosen |= dict(zip(classical, in_one_program(list(classical.values())), strict=True))
     times = np.linspace(0.0, t1, DEFAULT_SAVES)
     positions = lambda found: {name: np.asarray(found.position(*point)) for name, point in points.items()}
 
@@ -147,10 +148,14 @@ def compare(
         return jax.block_until_ready(found)
 
     report("compiling the reference run", None)
-    reference = run(None, Stepping(diffrax.Dopri8(), rtol=TIGHTEST), throw=True)
+    reference = run(DEFAULT_FORMULATION, Stepping(diffrax.Dopri8(), rtol=TIGHTEST), throw=True)
     known = None if exact is None else exact(times)
     answer = positions(reference) if known is None else known
-    other = run(None, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT), throw=True) if known is None else reference
+    other = (
+        run(DEFAULT_FORMULATION, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT), throw=True)
+        if known is None
+        else reference
+    )
     bound = DIVERGED * float(system_of(mechanism, float).length) if bound is None else bound
     passages = [float(passage) for passage in reference.passages().times]
     uncertainty = float(np.max(_apart(positions(other), answer)))
@@ -185,7 +190,7 @@ def _check_asked(t1, steppings, formulations, bound, repeats):
     if not isinstance(steppings, Sequence) or not steppings:
         raise ValueError(f"steppings are {steppings!r}; give a list of linkax.Stepping(solver, rtol=...)")
     for stepping in steppings:
-        instance(stepping, Stepping, "an entry of steppings", "give a linkax.Stepping(solver, rtol=...)")
+        require_type(stepping, Stepping, "an entry of steppings", "give a linkax.Stepping(solver, rtol=...)")
     if not isinstance(formulations, Mapping | Sequence) or isinstance(formulations, str) or not formulations:
         raise ValueError(f"formulations are {formulations!r}; give a list of names, or {{name: formulation}}")
 
@@ -204,7 +209,7 @@ def _timed(run, repeats):
 
 def _plain(found) -> Solution:
     """The same motion, read by programs that all formulations share."""
-    return dataclasses.replace(found, formulation=None)
+    return dataclasses.replace(found, run=found.run.changed(formulation=DEFAULT_FORMULATION))
 
 
 def _apart(positions, answer):
@@ -247,7 +252,7 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
         acceleration_violation=float(worst.acceleration),
         energy_error=float(np.max(np.abs(energy), initial=0.0) / (kinetic if kinetic > 0.0 else 1.0)),
         steps=steps,
-        evaluations=evaluations(stepping.solver, steps, getattr(found.formulation, "moves_after_steps", False)),
+        evaluations=evaluations(stepping.solver, steps, found.formulation.moves_after_steps),
         run_s=seconds,
         reached=float(found.t_end),
         verdict=verdict,

@@ -12,10 +12,10 @@ from linkax.analysis.mobility import row_names
 from linkax.equations.configuration import configure
 from linkax.equations.loops import immobile_residual, jacobian, residual
 from linkax.equations.system import system_of
-from linkax.model.numbers import instance
-from linkax.simulation.passages import singular_states
-from linkax.simulation.results import ENDED_WELL, result_name
-from linkax.simulation.solution import Solution
+from linkax.model.numbers import require_type
+from linkax.simulation.integrate.results import ENDED_WELL, result_name
+from linkax.simulation.read.passages import singular_states
+from linkax.simulation.read.solution import Solution
 from linkax.studies.free_parameters import FreeParameters
 
 DEPENDENT = 1e-4  # singular values of J in radians and lengths of the mechanism: of rows that depend on others
@@ -62,7 +62,7 @@ def differentiability(function: Callable, params: Any) -> Differentiability:
     **Raises:** `ValueError` for a function that returns no `Solution`, a batch, or one of a run that failed, and for
     saved times too far apart to show singular configurations.
     """
-    instance(function, Callable, "function", "give a function that returns a linkax.Solution")
+    require_type(function, Callable, "function", "give a function that returns a linkax.Solution")
     free = FreeParameters.of(params)
     solution = function(free.params(free.start))
     if not isinstance(solution, Solution):
@@ -128,6 +128,6 @@ def _linearised(function, free, mechanism, ts, qs):
         return jax.vmap(at)(ts, qs)
 
     system = system_of(mechanism, dtype)
-    slopes = jax.vmap(lambda t, q: jacobian(configure(system, t, q)) * system.units)(ts, qs)
+    slopes = jax.vmap(lambda t, q: jacobian(configure(system, t, q)) * system.scales)(ts, qs)
     still = jnp.zeros((len(ts), system.topology.num_immobile_rows, slopes.shape[-1]), dtype)
     return jnp.concatenate([slopes, still], axis=1), jax.jacfwd(opened)(free.start)

@@ -16,13 +16,13 @@ import optax
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
-from linkax.model.numbers import instance, number, require, whole_number
-from linkax.simulation.files import writable_folder, written_whole
+from linkax.model.numbers import number, require, require_type, whole_number
+from linkax.studies.files import writable_folder, written_whole
+from linkax.studies.fingerprint import fingerprint
 from linkax.studies.free_parameters import FreeParameters
-from linkax.studies.identity import fingerprint
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.parameters import as_arrays
-from linkax.studies.showing import progress_bar
+from linkax.studies.progress import progress_bar
 from linkax.studies.uncertainty import DEPENDENT, uncertainty
 
 DEFAULT_STEPS = {"residual": 100, "loss": 1000}
@@ -130,9 +130,11 @@ def fit(
 
     **Warns:** of parameters that the data do not determine; where the fit ended at an edge, or without derivative.
     """
-    instance(function, Callable, "function", "give a residual or a loss, a function of (params, *args)")
+    require_type(function, Callable, "function", "give a residual or a loss, a function of (params, *args)")
     free = FreeParameters.of(params)
-    args = as_arrays(tuple(instance(args, list | tuple, "args", "give a tuple of what else the function gets")), "args")
+    args = as_arrays(
+        tuple(require_type(args, list | tuple, "args", "give a tuple of what else the function gets")), "args"
+    )
     _check_ending(steps, tolerance, patience)
     shape = eqx.filter_eval_shape(lambda z, args: function(free.params(z), *args), free.start, args)
     _check_output(shape)
@@ -145,7 +147,7 @@ def fit(
     by_squares = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
     if not by_squares:
         known_ones = "give one of optax, such as optax.adam(1e-2), or a least-squares solver of optimistix"
-        instance(optimiser, optax.GradientTransformation, "optimiser", known_ones)
+        require_type(optimiser, optax.GradientTransformation, "optimiser", known_ones)
     if by_squares and is_loss:
         raise ValueError("least squares need a residual; this function returns one number, so give an optax optimiser")
     search = (_Squares if by_squares else _Descent)(optimiser, function, free, mode, is_loss)
@@ -382,7 +384,7 @@ class _Checkpoint(NamedTuple):
 
     @staticmethod
     def of(path, search, z, state, args) -> "_Checkpoint":
-        path = Path(instance(path, str | os.PathLike, "checkpoint", "give the name of a file"))
+        path = Path(require_type(path, str | os.PathLike, "checkpoint", "give the name of a file"))
         writable_folder(path.parent, f"give another checkpoint than {str(path)!r}")
         if path.is_dir():
             raise ValueError(f"checkpoint {str(path)!r} is a folder; give the name of a file")

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from linkax.model.numbers import is_finite, real, require
 from linkax.studies.parameters import AbstractParameter
-from linkax.studies.showing import path_parts
+from linkax.studies.progress import path_parts
 
 
 class FreeParameters(eqx.Module):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from linkax.model.numbers import instance, is_finite, namespace, real, require
+from linkax.model.numbers import is_finite, namespace, real, require, require_type
 from linkax.studies.parameters import as_arrays
 
 
@@ -41,7 +41,7 @@ def shoot(run: Callable, starts: Any, ts: Float[Array, " n_t"]) -> Shots:
 
     **Raises:** `ValueError` where the times do not fall into so many equal parts.
     """
-    instance(run, Callable, "run", "give a function (start, ts, t1) -> (end, outputs)")
+    require_type(run, Callable, "run", "give a function (start, ts, t1) -> (end, outputs)")
     starts = as_arrays(starts, "starts")
     sizes = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else 0 for leaf in jax.tree.leaves(starts)}
     if len(sizes) != 1:

@@ -16,12 +16,13 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 
-from linkax.model.numbers import instance, real, whole_number
-from linkax.simulation.results import ENDED_WELL, KNOWN_RESULTS, REMARKS, RESULTS, WARNINGS
-from linkax.simulation.solution import Solution
+from linkax.model.numbers import real, require_type, whole_number
+from linkax.simulation.integrate.results import ENDED_WELL, KNOWN_RESULTS, REMARKS, RESULTS, WARNINGS
+from linkax.simulation.read.solution import Solution
 from linkax.studies.parameters import as_arrays
-from linkax.studies.showing import progress_bar
+from linkax.studies.progress import progress_bar
 from linkax.studies.sweep_store import SweepStore
+from linkax.xla.enumerations import code, is_item, item
 
 DEFAULT_CHUNK = 256  # members on one device: more take no less time each
 DEFAULT_MEMORY = 2**31  # bytes
@@ -70,7 +71,7 @@ class Sweep(NamedTuple):
     def remarked(self) -> dict[int, str]:
         """{member: what there is to say of it}."""
         each = lambda member: REMARKS[jax.tree.map(lambda values: np.asarray(values[member]), self.remarks)]
-        return {int(member): each(member) for member in np.flatnonzero(self.remarks._value)}
+        return {int(member): each(member) for member in np.flatnonzero(code(self.remarks))}
 
     def count(self) -> dict[str, int]:
         """How many members ended in which way: {name of a result: number}."""
@@ -114,7 +115,7 @@ def sweep(
     **Warns:** of what is damaged in a store, and (`AccuracyWarning`, `StiffnessWarning`) of how many members there is
     something to say, see `Sweep.remarks`.
     """
-    instance(function, Callable, "function", "give a function of one set of parameters")
+    require_type(function, Callable, "function", "give a function of one set of parameters")
     params = as_arrays(params, "params")
     count = _members(params)
     devices = list(jax.local_devices()) if devices is None else _checked_devices(devices)
@@ -123,7 +124,7 @@ def sweep(
     if isinstance(memory, bool) or not isinstance(memory, numbers.Real) or not memory > 0:
         raise ValueError(f"memory is {memory!r}; it must be a positive number of bytes")
     if store is not None:
-        store = SweepStore.folder(instance(store, str | os.PathLike, "store", "give the name of a folder"))
+        store = SweepStore.folder(require_type(store, str | os.PathLike, "store", "give the name of a folder"))
         SweepStore.check("params", params)
     with progress_bar(count, "member", progress, smoothing=0.05) as bar:
         one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), params)
@@ -140,7 +141,7 @@ def sweep(
     output = eqx.combine(jax.tree.map(lambda array: array[back], arrays), program.static)
     remarks = _remarks(output, count)
     for name, category in WARNINGS.items():
-        if number := np.sum(remarks._value == getattr(REMARKS, name)._value):
+        if number := np.sum(code(remarks) == code(getattr(REMARKS, name))):
             told = f"{number} of {count} members: {REMARKS[getattr(REMARKS, name)]} Sweep.remarked tells which."
             warnings.warn(told, category, stacklevel=2)
     return Sweep(output, reasons[back], seconds / ran if ran else float("nan"), remarks)
@@ -148,12 +149,12 @@ def sweep(
 
 def _remarks(output, count) -> REMARKS:
     """Of each member the first that its output holds, or that applies to a solution in it."""
-    is_remark = lambda node: isinstance(node, type(REMARKS.none)) and node._enumeration is REMARKS
+    is_remark = lambda node: is_item(node, REMARKS)
     is_told = lambda node: is_remark(node) or isinstance(node, Solution)
     told = [node for node in jax.tree.leaves(output, is_leaf=is_told) if is_told(node)]
-    values = [(node if is_remark(node) else node.remark())._value.reshape(count, -1) for node in told]
+    values = [code(node if is_remark(node) else node.remark()).reshape(count, -1) for node in told]
     values = np.concatenate([*values, np.zeros((count, 1), np.int32)], axis=1)
-    return type(REMARKS.none)(values[np.arange(count), np.argmax(values != 0, axis=1)], REMARKS)
+    return item(values[np.arange(count), np.argmax(values != 0, axis=1)], REMARKS)
 
 
 def _is_struct(leaf):
@@ -190,7 +191,7 @@ def _order(difficulty, params, count, options):
 
 
 def _is_result(node):
-    return isinstance(node, type(RESULTS.successful)) and node._enumeration is RESULTS
+    return is_item(node, RESULTS)
 
 
 def _member(function):
@@ -214,7 +215,7 @@ def _member(function):
 
 
 def _reason(result):
-    found = jnp.full(jnp.shape(result._value), REASONS.index("failed"), jnp.int8)
+    found = jnp.full(jnp.shape(code(result)), REASONS.index("failed"), jnp.int8)
     for index, name in enumerate(KNOWN_RESULTS):
         found = jnp.where(result == getattr(RESULTS, name), index, found).astype(jnp.int8)
     return found
@@ -238,7 +239,7 @@ class _Program(NamedTuple):
         """How many chunks are computed at once.
 
         Calls of LAPACK for batches, from programs that run at once on a CPU, may wait for each other for ever
-        (jaxlib 0.10: they wait for threads of the pool that they run in). linkax makes none, see `linkax.tracing`.
+        (jaxlib 0.10: they wait for threads of the pool that they run in). linkax makes none, see `linkax.xla.tracing`.
         """
         if jax.default_backend() != "cpu":
             return 2  # one is computed while the results of another are copied

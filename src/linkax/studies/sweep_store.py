@@ -11,9 +11,9 @@ import jax
 import numpy as np
 import zarr
 
-from linkax.simulation.files import synced, writable_folder, written_whole
-from linkax.studies.identity import fingerprint
-from linkax.studies.showing import path_parts
+from linkax.studies.files import synced, writable_folder, written_whole
+from linkax.studies.fingerprint import fingerprint
+from linkax.studies.progress import path_parts
 
 FORMAT = 2
 LABELLED = ("", "member", "reason", "done")  # these say in their attributes which sweep they are of

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.model.joints.joint import AbstractJoint, JointKind, Motion
+from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
 from linkax.model.terms import Term
 from linkax.spatial.rotations import compose
 from linkax.spatial.screws import exponential, screw_matrix
@@ -64,10 +64,10 @@ def section_at(coordinates, strains, length, place):
 
 
 @dataclasses.dataclass(frozen=True)
-class WithinElement(Motion):
+class WithinElement(RelativeMotion):
     """From an element's first node to a section of it, at a distance that a last coordinate may add to.
 
-    Numbers: the element's length, where the section is from 0 to 1 without that coordinate, and whether the way
+    Parameters: the element's length, where the section is from 0 to 1 without that coordinate, and whether the way
     may go on before the element, and behind it; else it ends there.
 
     - `strains`: which components are coordinates; the others are zero.
@@ -75,8 +75,8 @@ class WithinElement(Motion):
 
     strains: tuple[int, ...]
 
-    def __call__(self, coordinates, numbers):
-        length, place, goes_before, goes_behind = numbers
+    def __call__(self, coordinates, parameters):
+        length, place, goes_before, goes_behind = parameters
         strains, along = jnp.split(coordinates, [2 * len(self.strains)])
         end = place + jnp.sum(along) / length
         end = jnp.where((end >= 0.0) | (goes_before > 0.0), end, 0.0)
@@ -107,7 +107,7 @@ class OnBeam(AbstractJoint):
         self.elements, self.element, self.length = beam.elements, element, beam.element_length
 
     @property
-    def movers(self):
+    def driven_by(self):
         count = len(self.strains)
         return tuple(Term(self.beam, index) for index in range(self.element * count, (self.element + 2) * count))
 
@@ -155,11 +155,11 @@ class BeamSegment(OnBeam):
         return JointKind("BeamSegment", WithinElement(self.strains), (self.elements + 1) * of_node)
 
     @property
-    def numbers(self):
+    def parameters(self):
         return jnp.stack(jnp.broadcast_arrays(self.length, self.place, 1.0, 1.0))
 
     @property
-    def reach(self):
+    def length_estimate(self):
         return self.length * self.place
 
 
@@ -177,16 +177,16 @@ class SleevePart(OnBeam):
         return JointKind("Sliding", WithinElement(self.strains), ("m",) if self.name == self.sleeve else ())
 
     @property
-    def movers(self):
-        return (*super().movers, Term(self.sleeve, None))
+    def driven_by(self):
+        return (*super().driven_by, Term(self.sleeve, None))
 
     @property
-    def numbers(self):
+    def parameters(self):
         ends = float(self.element == 0), float(self.element == self.elements - 1)
         return jnp.stack(jnp.broadcast_arrays(self.length, -float(self.element), *ends))
 
     @property
-    def reach(self):
+    def length_estimate(self):
         return self.length
 
     @property

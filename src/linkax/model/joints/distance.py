@@ -37,7 +37,7 @@ class Distance(AbstractJoint):
         self.length = positive(length, f"distance {name!r}: length [m]", remedy)
 
     @property
-    def number(self):
+    def parameter(self):
         return self.length
 
     @staticmethod
@@ -45,5 +45,5 @@ class Distance(AbstractJoint):
         return jnp.zeros(0, separation.dtype)
 
     @staticmethod
-    def combined(rotations, translations, number):
-        return (jnp.sum(translations * translations) / number - number) / 2.0
+    def combined(rotations, translations, parameter):
+        return (jnp.sum(translations * translations) / parameter - parameter) / 2.0

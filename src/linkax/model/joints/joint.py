@@ -9,17 +9,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from linkax.model.bodies import Frame, frame_of
-from linkax.model.numbers import Constant, flag, perpendicular_axes, unit_axis, value
+from linkax.model.numbers import Constant, perpendicular_axes, require_bool, unit_axis, value
 from linkax.model.terms import Term
 from linkax.spatial.rotations import frame_about_axis, rotation_about_first_axis
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion(abc.ABC):
+class RelativeMotion(abc.ABC):
     """The motion of a joint in the tree, as a pure function that JAX differentiates."""
 
     @abc.abstractmethod
-    def __call__(self, coordinates: Float[Array, " n"], numbers: Float[Array, " k"]):
+    def __call__(self, coordinates: Float[Array, " n"], parameters: Float[Array, " k"]):
         """The child's frame seen from the parent's, in joint axes, (4, 4), see `linkax.spatial.screws`.
 
         Of joints with the same motion that have fewer coordinates than others, the last ones may be given as zero.
@@ -28,13 +28,13 @@ class Motion(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class JointKind:
-    """What a topology keeps of a joint in the tree that has a `Motion`; compared by value.
+    """What a topology keeps of a joint in the tree that has a `RelativeMotion`; compared by value.
 
     It says what the class of another joint says of itself, see `AbstractJoint`.
     """
 
     name: str
-    motion: Motion
+    motion: RelativeMotion
     speed_units: tuple[str, ...]
 
     has_quaternion: ClassVar[bool] = False
@@ -66,11 +66,11 @@ class AbstractJoint(eqx.Module):
     # angular part is that at coordinate zero where `angular_subspace_at` says otherwise.
     angular_subspace: ClassVar[tuple[tuple[float, float, float], ...]]
     linear_subspace: ClassVar[tuple[tuple[float, float, float], ...]]
-    # The linear part is to be multiplied by `number`.
+    # The linear part is to be multiplied by `parameter`.
     is_screw: ClassVar[bool] = False
     # The angular part for joints whose axes turn with their own coordinates: (coordinates) -> (n, 3).
     angular_subspace_at: ClassVar = None
-    # All of the motion, for joints that bend with other coordinates than their own; see `Motion`.
+    # All of the motion, for joints that bend with other coordinates than their own; see `RelativeMotion`.
     motion: ClassVar = None
     # Pairs (i, j), counted from 0, of axes that stay orthogonal: parent's hⁱ and child's hʲ.
     locked_rotations: ClassVar[tuple[tuple[int, int], ...]]
@@ -114,7 +114,7 @@ class AbstractJoint(eqx.Module):
         if second_axis is not None:
             what = f"joint {name!r}: second_axis"
             self.axis, self.second_axis = perpendicular_axes(self.axis, second_axis, what)
-        self.cut = flag(cut, f"joint {name!r}: cut")
+        self.cut = require_bool(cut, f"joint {name!r}: cut")
 
     @property
     def num_coordinates(self) -> int:
@@ -127,22 +127,22 @@ class AbstractJoint(eqx.Module):
         return type(self)
 
     @property
-    def movers(self) -> tuple[Term, ...] | None:
+    def driven_by(self) -> tuple[Term, ...] | None:
         """Whose coordinates move it, in the order that its `motion` reads them; None for its own alone."""
         return None
 
     @property
-    def numbers(self) -> Float[Array, " k"] | None:
+    def parameters(self) -> Float[Array, " k"] | None:
         """The numbers that its `motion` needs."""
         return None
 
     @property
-    def reach(self):
+    def length_estimate(self):
         """About how far its `motion` takes the child from the parent [m]."""
         return 0.0
 
     @property
-    def number(self):
+    def parameter(self):
         """The number of this joint that its type's rows or motion need (a length [m]), or None."""
         return None
 
@@ -163,8 +163,8 @@ class AbstractJoint(eqx.Module):
         """Coordinates from the child's axes and origin, both in joint axes of the parent."""
 
     @staticmethod
-    def combined(rotations, translations, number) -> Float[Array, ""]:
-        """The row that combines others; `number` is the joint's own in units of ℓ."""
+    def combined(rotations, translations, parameter) -> Float[Array, ""]:
+        """The row that combines others; `parameter` is the joint's own in units of ℓ."""
         raise NotImplementedError
 
 

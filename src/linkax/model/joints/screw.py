@@ -36,7 +36,7 @@ class Screw(AbstractJoint):
         self.pitch = require(number(pitch, (), what), lambda p: p != 0.0, what, "without advance, use lx.Revolute")
 
     @property
-    def number(self):
+    def parameter(self):
         return self.pitch
 
     rotation = staticmethod(hinged)
@@ -46,7 +46,7 @@ class Screw(AbstractJoint):
         return angle_about_first_axis(rotation)[None]
 
     @staticmethod
-    def combined(rotations, translations, number):
+    def combined(rotations, translations, parameter):
         angle = jnp.arctan2(rotations[1], rotations[0])
-        turns = lax.stop_gradient(jnp.round((translations[0] / number - angle) / (2.0 * jnp.pi)))
-        return translations[0] - number * (angle + 2.0 * jnp.pi * turns)
+        turns = lax.stop_gradient(jnp.round((translations[0] / parameter - angle) / (2.0 * jnp.pi)))
+        return translations[0] - parameter * (angle + 2.0 * jnp.pi * turns)

@@ -1,0 +1,85 @@
+"""A run in numbers: what is printed of it, and what is kept."""
+
+import numpy as np
+
+from linkax.cli.progress_run import TimedRun
+from linkax.simulation.integrate.results import RESULTS, result_name
+from linkax.simulation.read.solution import Solution
+
+
+def summary(run: TimedRun, points) -> dict:
+    """Steps, times, violations, energy error, rank, passages, result and final positions of a run.
+
+    Violations are relative (`Solution.worst_violation`); `energy_error` is the largest change of
+    the energy over the largest kinetic energy, or in joules where nothing moves: an error only
+    where no drive, damping or force of time adds or takes any. Of singular configurations: the
+    smallest distance at a saved time, the times of passages [s], and the digits that they cost
+    (`Solution.passages`). What is not finite, or not measured, is None.
+    """
+    solution = run.solution
+    reached = np.isfinite(np.asarray(solution.ts))
+    violation = solution.worst_violation()
+    energy, kinetic = np.asarray(solution.energy())[reached], np.asarray(solution.kinetic_energy())[reached]
+    rank = np.asarray(solution.rank())[reached]
+    drift, scale = np.max(np.abs(energy - energy[:1]), initial=0.0), np.max(kinetic, initial=0.0)
+    passed = solution.passages()
+    last = np.flatnonzero(reached)[-1] if np.any(reached) else 0
+    return {
+        "steps": int(solution.stats["num_steps"]),
+        "rejected_steps": int(solution.stats["num_rejected_steps"]),
+        "compile_s": run.compile_s,
+        "run_s": run.run_s,
+        "optimised": run.optimised,
+        "position_violation": finite(violation.position),
+        "velocity_violation": finite(violation.velocity),
+        "acceleration_violation": finite(violation.acceleration),
+        "energy_error": finite(drift / scale if scale > 0.0 else drift),
+        "rank_min": int(np.min(rank, initial=rank[0] if len(rank) else 0)),
+        "rank_max": int(np.max(rank, initial=0)),
+        "singularity_distance": finite(np.min(np.asarray(solution.singularity_distance())[reached], initial=1.0)),
+        "passages": [float(time) for time in passed.times],
+        "digits_lost": finite(passed.digits),
+        "result": result_name(solution.result),
+        "message": "" if result_name(solution.result) == "successful" else str(RESULTS[solution.result]),
+        "t_end": finite(solution.t_end),
+        "final": {
+            name: [finite(part) for part in np.asarray(solution.position(body, at))[last]]
+            for name, (body, at) in points.items()
+        },
+    }
+
+
+def finite(number):
+    """A number for JSON, which has no infinity: None in place of what is not finite."""
+    return float(number) if np.isfinite(number) else None
+
+
+def trajectory(solution: Solution, points) -> dict[str, np.ndarray]:
+    """Arrays for an NPZ file, times first, SI units, ground axes.
+
+    - `t`, `q`, `v`, `coordinates`, `speeds`: see `states`; `energy`; `rank`; `position_violation`,
+      `velocity_violation`, `acceleration_violation` as in `linkax.Violation`.
+    - `position_NAME`, `velocity_NAME`, `acceleration_NAME` of each named point.
+    - `force_NAME`, `moment_NAME`: reaction of each joint on its child.
+    """
+    kept = states(solution) | {"energy": solution.energy(), "rank": solution.rank()}
+    kept |= {f"{level}_violation": values for level, values in solution.violation()._asdict().items()}
+    for name, (body, at) in points.items():
+        kept[f"position_{name}"] = solution.position(body, at)
+        kept[f"velocity_{name}"] = solution.velocity(body, at)
+        kept[f"acceleration_{name}"] = solution.acceleration(body, at)
+    for joint, reaction in solution.reactions().items():
+        kept[f"force_{joint}"], kept[f"moment_{joint}"] = reaction
+    return {name: np.asarray(values) for name, values in kept.items()}
+
+
+def states(solution: Solution) -> dict[str, np.ndarray]:
+    """What of a trajectory compiles nothing.
+
+    `t`; `q` and `coordinates`, `v` and `speeds`: coordinates and speeds of the tree's joints, and whose each is.
+    """
+    topology = solution.mechanism.topology
+    owners = lambda slices: [name for name, taken in slices.items() for _ in range(taken.stop - taken.start)]
+    kept = {"t": solution.ts, "q": solution.q, "v": solution.v}
+    kept |= {"coordinates": owners(topology.coordinates), "speeds": owners(topology.speeds)}
+    return {name: np.asarray(values) for name, values in kept.items()}

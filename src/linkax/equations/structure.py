@@ -1,0 +1,59 @@
+"""Which loop rows and speeds of a mechanism depend on each other: islands, and the order of elimination."""
+
+from functools import cache
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.linalg.elimination_plan import PER_FRONT, EliminationPlan, plan_elimination
+from linkax.model.topology import Topology
+
+
+class Island(NamedTuple):
+    """A part of a mechanism that moves independently of the rest: its loop rows and its speeds."""
+
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+
+
+class Structure(NamedTuple):
+    """How the equations of a mechanism fall apart.
+
+    - `islands`: parts that neither a loop nor an inertia connects, in the order of their speeds.
+    - `elimination`: fronts in which the loops are solved one after the other; None where all at once takes less.
+    """
+
+    islands: tuple[Island, ...]
+    elimination: EliminationPlan | None
+
+    def ranks_of_islands(self, ranks):
+        """Add up the ranks of fronts, (k,), for each island."""
+        plan = self.elimination
+        first = [
+            min((*interior, *separator)) for interior, separator in zip(plan.interior, plan.separator, strict=True)
+        ]
+        is_part = np.array([np.isin(first, columns) for _, columns in self.islands])
+        return jnp.asarray(is_part, int) @ ranks
+
+
+@cache
+def structure_of(topology: Topology) -> Structure:
+    """The islands of a mechanism, and its fronts where they take less work."""
+    islands = _islands(topology)
+    at_once = sum(len(columns) ** 2 * (len(columns) + 2 * len(rows)) for rows, columns in islands)
+    if topology.num_rows == 0 or at_once <= PER_FRONT:
+        return Structure(islands, None)
+    plan = plan_elimination(topology.read_by_rows, topology.coupled_by_inertia, topology.num_speeds)
+    return Structure(islands, plan if plan.work < at_once else None)
+
+
+def _islands(topology):
+    label = np.arange(topology.num_speeds)
+    for together in (*topology.coupled_by_inertia, *topology.read_by_rows):
+        label[np.isin(label, label[together])] = np.min(label[together], initial=topology.num_speeds)
+    row_label = np.array([label[columns[0]] if len(columns) else 0 for columns in topology.read_by_rows], dtype=int)
+    return tuple(
+        Island(tuple(np.flatnonzero(row_label == part)), tuple(np.flatnonzero(label == part)))
+        for part in np.unique(label)
+    )

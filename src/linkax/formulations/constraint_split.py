@@ -1,0 +1,102 @@
+"""Branches of motion that cross in a singular configuration: which one a state is on.
+
+Where the rank of J falls, more speeds satisfy J v = b than motions exist. A motion has an
+acceleration, so γ must lie in the range of J: uᵀγ(v, v) = 0 for every u with uᵀJ = 0, quadratic
+equations for the speeds, whose solutions are the branches.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from linkax.equations.configuration import Configuration, configure
+from linkax.equations.loops import drive_acceleration, jacobian, velocity_gamma
+from linkax.equations.motion import move
+from linkax.equations.system import System
+from linkax.linalg.constrained_solve import SaddleInverse, constrained_solve, invert_apart
+from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.spatial.vectors import length
+
+OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
+
+
+class ConstraintSplit(eqx.Module):
+    """A configuration as a crossing of branches; of one branch alone where the rank of J is constant.
+
+    - `jacobian`: J, (m, n_v), and `inverse`, its split of the space of speeds, in any metric.
+    """
+
+    configuration: Configuration
+    jacobian: Float[Array, "m n_v"]
+    inverse: SaddleInverse
+
+    @staticmethod
+    def at(system: System, t, q, rank_tolerance) -> "ConstraintSplit":
+        """At coordinates q."""
+        return ConstraintSplit.of(configure(system, t, q), rank_tolerance)
+
+    @staticmethod
+    def of(configuration: Configuration, rank_tolerance) -> "ConstraintSplit":
+        """Split in the identity metric."""
+        system, rows = configuration.system, jacobian(configuration)
+        inverse = invert_apart(None, rows, system.scales, rank_tolerance, system.structure.islands)
+        return ConstraintSplit(configuration, rows, inverse)
+
+    def _outside(self, rows):
+        """Rows of which the part that J reaches is taken off."""
+        return rows - self.jacobian @ (self.inverse.normal @ rows)
+
+    def _bias(self, v):
+        return velocity_gamma(move(self.configuration, v))
+
+    def _basis_of_ones(self):
+        """The basis of the null space of J with each direction of size one, whatever the metric that it is in."""
+        basis = self.inverse.basis
+        size = length(basis / self.configuration.system.scales[:, None], axis=0)
+        return basis / jnp.where(size > 0.0, size, 1.0)
+
+    def off_branch(self, v, scale=1.0) -> Float[Array, " m"]:
+        """The part of γ(v, v) outside the range of J: zero for speeds on a branch.
+
+        `scale`: what the speeds v are to be multiplied by; that of γ is then its square.
+        """
+        gamma, scales = self._bias(v) + self._driven(scale), self.configuration.system.scales
+        # With derivatives, which the split has none of; J a is the same in any metric.
+        metric, still = jnp.diag(scales**-2), jnp.zeros_like(v)
+        return (
+            gamma
+            - self.jacobian @ constrained_solve(self.inverse, metric, self.jacobian, still, gamma, refinements=0)[0]
+        )
+
+    def _driven(self, scale):
+        return drive_acceleration(self.configuration.system, self.configuration.t) / scale**2
+
+    def along(self, v, from_rest) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
+        """Along speeds v, of any size: how far they are from a branch, and the ranks of all islands next to here.
+
+        Where v are accelerations `from_rest`, what drives ask for is relative to them, and not to their square.
+
+        The first is `off_branch` of speeds of which the largest is one; the second, by first-order
+        perturbation, rank(J) + rank(Uᵀ J̇ N) with U, N the null spaces of Jᵀ and J.
+        """
+        fastest = self.configuration.system.fastest(v)
+        scale = jnp.where(fastest > 0.0, fastest, 1.0)
+        direction = v / scale
+        # γ = −J̇ v is quadratic in v, so −J̇ w is a quarter of γ(v + w) − γ(v − w). All at once, to compile γ once.
+        basis = self._basis_of_ones()
+        speeds = jnp.concatenate([direction[:, None], direction[:, None] + basis, direction[:, None] - basis], axis=1)
+        outside = self._outside(jax.vmap(self._bias, in_axes=1, out_axes=1)(speeds))
+        plus, minus = jnp.split(outside[:, 1:], 2, axis=1)
+        turning = 0.25 * (plus - minus)
+
+        def opening(rows, columns):
+            if not rows:
+                return jnp.zeros((), int)
+            block = turning[np.ix_(rows, columns)]
+            return jnp.sum(jnp.abs(jnp.diagonal(pivoted_qr(block).r)) > OPENING)
+
+        opened = jnp.stack([opening(*island) for island in self.configuration.system.structure.islands])
+        driven = self._driven(jnp.where(from_rest, jnp.sqrt(scale), scale))
+        return outside[:, 0] + self._outside(driven), self.inverse.rank + opened

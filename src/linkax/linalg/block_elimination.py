@@ -1,0 +1,264 @@
+"""The constrained solve for a mechanism whose loops follow each other, in time proportional to their number.
+
+What `linkax.linalg.constrained_solve.invert` does at once is done front by front (see `elimination_plan`). A front's
+own speeds, and what motions of the fronts before it still affect it, are split by a column-pivoted QR of its rows into
+a normal and a tangent space. The tangent space is turned, so that few directions affect the speeds which are passed on,
+and these go on to the next front; of the others the dynamics are solved. All turns are orthogonal in units of the
+speeds, so that nothing grows from front to front, and ranks are found at any singular configuration.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from linkax.linalg.constrained_solve import independent
+from linkax.linalg.elimination_plan import EliminationPlan
+from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.linalg.static_sparse import StaticSparse, constant_product
+from linkax.linalg.triangular import cholesky_inverse, upper_inverse
+from linkax.spatial.vectors import length
+from linkax.xla.derivatives import ratio
+
+
+class Blocks(NamedTuple):
+    """What the fronts have of J and M: a front reads s kept speeds, and p that it adds, by m rows.
+
+    - `rows`: (k, m, s + p). `coupling`: M of kept and added speeds, (k, s, p). `own`: M of the added, (k, p, p).
+    """
+
+    rows: Float[Array, "k m s+p"]
+    coupling: Float[Array, "k s p"]
+    own: Float[Array, "k p p"]
+
+
+class BlockInverse(eqx.Module):
+    """The inverse of [[M, -Jᵀ], [J, 0]] on the independent rows of J, as what each front passes on.
+
+    Speeds, and forces along them, are in units. From front to front go, forwards, the load on the directions passed on
+    and the part of the kept speeds that is decided; backwards the motion along these directions and the force on the
+    kept speeds. Both are linear in what comes in and in a front's own f and γ.
+
+    - `forwards`: (k, 2s, 2s + p + m). `backwards`: (k, 2s + p + m, 4s + p + m).
+    - `last`: inverse of the metric of the directions after the last front, (s, s).
+    - `rank`, (k,), `distance`, `definiteness`: see `linkax.linalg.constrained_solve.SaddleInverse`.
+    """
+
+    plan: EliminationPlan = eqx.field(static=True)
+    scales: Float[Array, " n"]
+    forwards: Float[Array, "k 2s 2s+p+m"]
+    backwards: Float[Array, "k 2s+p+m 4s+p+m"]
+    last: Float[Array, "s s"]
+    rank: Int[Array, " k"]
+    distance: Float[Array, ""]
+    definiteness: Float[Array, ""]
+
+    def apply(self, f, gamma):
+        """(a, λ) for the system that was inverted."""
+        plan, kept = self.plan, self.last.shape[0]
+        added = plan.interior_table.shape[1]
+        own = jnp.concatenate([_read(self.scales * f, plan.interior_table), _read(gamma, plan.row_table)], axis=1)
+        nothing = jnp.zeros(2 * kept, own.dtype)
+
+        def forwards(passed, front):
+            matrix, own = front
+            known = jnp.concatenate([passed, own])
+            return matrix @ known, known
+
+        passed, known = lax.scan(forwards, nothing, (self.forwards, own))
+        along = self.last @ passed[:kept]
+
+        def backwards(returned, front):
+            matrix, known = front
+            found = matrix @ jnp.concatenate([returned, known])
+            return found[: 2 * kept], found[2 * kept :]
+
+        returned = jnp.concatenate([along, jnp.zeros(kept, along.dtype)])
+        _, found = lax.scan(backwards, returned, (self.backwards, known), reverse=True)
+        a = self.scales * _gathered(found[:, :added], plan.interior_table, f.shape[0])
+        return a, _gathered(found[:, added:], plan.row_table, gamma.shape[0])
+
+
+def invert_by_blocks(blocks: Blocks, scales, tolerance, plan: EliminationPlan, rank_nearby=None) -> BlockInverse:
+    """Like `linkax.linalg.constrained_solve.invert`, front by front; `rank_nearby` of each front, (k,)."""
+    blocks, scales = lax.stop_gradient((blocks, scales))
+    kept_unit, added_unit = (_read(scales, table) for table in (plan.separator_table, plan.interior_table))
+    absent = jnp.asarray(plan.interior_table < 0, scales.dtype)
+    blocks = Blocks(
+        rows=blocks.rows * jnp.concatenate([kept_unit, added_unit], axis=1)[:, None, :],
+        coupling=blocks.coupling * kept_unit[:, :, None] * added_unit[:, None, :],
+        own=blocks.own * added_unit[:, :, None] * added_unit[:, None, :] + jax.vmap(jnp.diag)(absent),
+    )
+    dtype, (fronts, rows, width), kept = scales.dtype, blocks.rows.shape, blocks.coupling.shape[1]
+    known = jnp.full(fronts, min(rows, width)) if rank_nearby is None else rank_nearby
+    here = _Here(kept, jnp.max(length(blocks.rows)), tolerance, rank_nearby is not None)
+    begin = _Passed(jnp.zeros((kept, kept), dtype), jnp.eye(kept, dtype=dtype), jnp.ones(kept, dtype))
+    passed, found = lax.scan(here.eliminate, begin, (blocks, jnp.asarray(plan.passed_on, dtype), known))
+    last, definiteness = _definite(passed.metric, passed.size)
+    return BlockInverse(
+        plan=plan,
+        scales=scales,
+        forwards=found.forwards,
+        backwards=found.backwards,
+        last=last.T @ last,
+        rank=found.rank,
+        distance=jnp.min(found.distance),
+        definiteness=jnp.minimum(definiteness, jnp.min(found.definiteness)),
+    )
+
+
+def in_fronts(plan: EliminationPlan, weight: StaticSparse, jacobian: StaticSparse) -> Blocks:
+    """The entries of M and J that the fronts read."""
+    kept, added = plan.separator_table, plan.interior_table
+    return Blocks(
+        rows=_blocks(jacobian, plan.row_table, plan.table),
+        coupling=_blocks(weight, kept, added),
+        own=_blocks(weight, added, added),
+    )
+
+
+def with_identity_metric(blocks: Blocks, plan: EliminationPlan, scales) -> Blocks:
+    """The same rows, and instead of M the metric that measures speeds by their units."""
+    own = jax.vmap(jnp.diag)(jnp.where(plan.interior_table < 0, 0.0, _read(scales, plan.interior_table) ** -2))
+    return Blocks(blocks.rows, jnp.zeros_like(blocks.coupling), own)
+
+
+class SaddlePointInFronts(eqx.Module):
+    """[[M, -Jᵀ], [J, 0]], to be multiplied with (a, λ) in one vector, (n,) and (m,) of `sizes`."""
+
+    blocks: Blocks
+    plan: EliminationPlan = eqx.field(static=True)
+    sizes: tuple[int, int] = eqx.field(static=True)
+
+    def __call__(self, unknowns):
+        blocks, (table, rows), (n, m) = self.blocks, (self.plan.table, self.plan.row_table), self.sizes
+        coupled = jnp.pad(blocks.coupling, ((0, 0), (0, 0), (blocks.coupling.shape[1], 0)))
+        own = jnp.concatenate([jnp.swapaxes(blocks.coupling, 1, 2), blocks.own], axis=2)
+        weight = jnp.concatenate([coupled, own], axis=1)
+        a, multipliers = _read(unknowns[:n], table), _read(unknowns[n:], rows)
+        force = _times(weight, a) - _times(jnp.swapaxes(blocks.rows, 1, 2), multipliers)
+        along = constant_product(table.ravel() == np.arange(n)[:, None], force.reshape(-1))
+        return jnp.concatenate([along, _gathered(_times(blocks.rows, a), rows, m)])
+
+
+class _Passed(NamedTuple):
+    """What a front passes on: the kept speeds along each direction, (s, s), their metric, and its size without loss."""
+
+    along: Float[Array, "s s"]
+    metric: Float[Array, "s s"]
+    size: Float[Array, " s"]
+
+
+class _Eliminated(NamedTuple):
+    forwards: Float[Array, "2s 2s+p+m"]
+    backwards: Float[Array, "2s+p+m 4s+p+m"]
+    rank: Int[Array, ""]
+    distance: Float[Array, ""]
+    definiteness: Float[Array, ""]
+
+
+class _Here(NamedTuple):
+    """The number of kept speeds, the length of the longest row, and how independent rows are told."""
+
+    kept: int
+    size: Float[Array, ""]
+    tolerance: Float[Array, ""]
+    is_known: bool
+
+    def eliminate(self, passed: _Passed, front):
+        """One front: y are the directions passed on and the added speeds."""
+        blocks, onward, rank = front
+        kept, (rows, width) = self.kept, blocks.rows.shape
+        added, count, dtype = width - kept, min(rows, width), blocks.rows.dtype
+        of_kept = blocks.rows[:, :kept]
+        reads = jnp.concatenate([of_kept @ passed.along, blocks.rows[:, kept:]], axis=1)
+        moves = jnp.concatenate([onward[:, :kept] @ passed.along, onward[:, kept:]], axis=1)
+        coupling = passed.along.T @ blocks.coupling
+        metric = jnp.block([[passed.metric, coupling], [coupling.T, blocks.own]])
+        size = jnp.concatenate([passed.size, jnp.diagonal(blocks.own)])
+
+        q, r, order = pivoted_qr(reads.T)
+        active, distance = independent(r, self.tolerance, rank if self.is_known else None, self.size)
+        identity = jnp.eye(count, dtype=dtype)
+        triangle = jnp.where(active[:, None] & active[None, :], r[:count, :count], identity)
+        chosen = (order[:count, None] == jnp.arange(rows)).astype(dtype)
+        # n = P (γ - ...): motion in the normal space that rows ask for.
+        asked = upper_inverse(triangle).T @ jnp.where(active[:, None], chosen, 0.0)
+        # Normal directions last, so that turning the others leaves them as they are.
+        q, asked = q[:, ::-1], asked[::-1]
+        places = jnp.arange(width)
+        is_normal = places >= width - jnp.sum(active)
+        basis = q @ pivoted_qr(jnp.where(is_normal[:, None], 0.0, (moves @ q).T)).q
+        passes = (places < kept) & ~is_normal
+        stays = (places >= kept) & ~is_normal
+        moves = moves @ basis
+        metric = basis.T @ metric @ basis
+        inside = jnp.where(stays[:, None] & stays[None, :], metric, jnp.diag(jnp.where(stays, 0.0, 1.0)))
+        size = size @ basis**2
+        root, definiteness = _definite(inside, jnp.where(stays, size, 1.0))
+        solved = jnp.where(stays[:, None] & stays[None, :], root.T @ root, 0.0)
+        to_stay = solved @ metric  # A H: what staying directions do when others move
+
+        # Columns of the identity: the load and the decided speeds passed on, f, γ.
+        known = 2 * kept + added + rows
+        columns = jnp.eye(known, dtype=dtype)
+        load, decided, f, gamma = jnp.split(columns, [kept, 2 * kept, 2 * kept + added])
+        load = basis.T @ jnp.concatenate([load, f - blocks.coupling.T @ decided])
+        along_normal = asked @ (gamma - of_kept @ decided)
+        remaining = load - metric[:, width - count :] @ along_normal
+        staying = solved @ remaining
+        on = jnp.where(passes[:, None], remaining - metric @ staying, 0.0)[:kept]
+        decided_on = onward[:, :kept] @ decided + moves[:, width - count :] @ along_normal
+        forwards = jnp.concatenate([on, decided_on])
+
+        # The same, and before them the motion along directions passed on and the force on the speeds passed on.
+        behind = lambda columns: jnp.pad(columns, ((0, 0), (2 * kept, 0)))
+        onwards = jnp.where(passes[:, None], jnp.eye(width, 2 * kept + known, dtype=dtype), 0.0)
+        normally = jnp.pad(along_normal, ((width - count, 0), (0, 0)))
+        motion = onwards - to_stay @ onwards + behind(staying + normally)
+        force = jnp.eye(kept, 2 * kept + known, kept, dtype=dtype)
+        held = (metric @ motion - behind(load))[width - count :] - moves[:, width - count :].T @ force
+        multipliers = asked.T @ held
+        y = basis @ motion
+        back = onward[:, :kept].T @ force + of_kept.T @ multipliers - blocks.coupling @ y[kept:]
+        backwards = jnp.concatenate([y[:kept], back, y[kept:], multipliers])
+
+        condensed = metric - metric @ to_stay
+        both = passes[:, None] & passes[None, :]
+        following = _Passed(
+            along=jnp.where(passes, moves, 0.0)[:, :kept],
+            metric=jnp.where(both, condensed, jnp.diag(jnp.where(passes, 0.0, 1.0)))[:kept, :kept],
+            size=jnp.where(passes, size, 1.0)[:kept],
+        )
+        return following, _Eliminated(forwards, backwards, jnp.sum(active), distance, definiteness)
+
+
+def _times(matrices, vectors):
+    return jnp.sum(matrices * vectors[:, None, :], axis=-1)
+
+
+def _definite(metric, size):
+    """L⁻¹ of a metric L Lᵀ, and the smallest of the squared diagonal of L relative to what no loss would leave."""
+    root, diagonal = cholesky_inverse(metric)
+    return root, jnp.min(ratio(diagonal**2, size, 0.0), initial=1.0)
+
+
+def _read(values, table):
+    """Values (n,) at the places of a table, zero where it is filled up."""
+    return jnp.concatenate([values, jnp.zeros(1, values.dtype)])[table]  # -1 and beyond the end
+
+
+def _blocks(matrix, down, across):
+    down, across = down[:, :, None], across[:, None, :]
+    return jnp.where((down >= 0) & (across >= 0), matrix.at(down, across), 0.0)
+
+
+def _gathered(found, table, size):
+    """Values of fronts (k, p) in the order of what a table names; zero for what it does not name."""
+    source = np.full(size, table.size)
+    source[table[table >= 0]] = np.flatnonzero(table.ravel() >= 0)
+    return _read(found.reshape(-1), source)

@@ -1,0 +1,88 @@
+"""Products with matrices of which most entries are known to be zero when a program is compiled.
+
+What connects the bodies of a large mechanism concerns few of them at a time. Each product is computed by reading the
+entries that it needs, where these are few, and as a product of full matrices where they are not. What is read XLA
+computes anew for each entry that reads it, so that one such product must not follow another.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+SPARSE = 0.25  # of the entries: what is read is slower than what is in order
+LARGE = 256  # entries of a full matrix that are not worth it
+
+
+def constant_product(matrix: np.ndarray, values):
+    """A constant matrix (k, n) times `values` (n, …): (k, …)."""
+    flat = values.reshape(len(values), -1)
+    width = int(np.max(np.count_nonzero(matrix, axis=1), initial=0))
+    if not _is_worth_it(len(matrix) * width, matrix.size):
+        found = jnp.asarray(matrix, values.dtype) @ flat
+    else:
+        # The nonzero entries of each row first, filled up with zeros.
+        places = np.argsort(matrix == 0.0, axis=1, kind="stable")[:, :width]
+        factors = jnp.asarray(np.take_along_axis(matrix, places, axis=1), values.dtype)
+        found = jnp.sum(factors[:, :, None] * flat[places], axis=1)
+    return found.reshape(len(matrix), *values.shape[1:])
+
+
+class StaticSparse(NamedTuple):
+    """A matrix by its entries that can be other than zero.
+
+    - `values`: (k,). `places`: for each entry of the matrix 1 + its place among the values, or 0 where it is zero.
+    """
+
+    values: Float[Array, " k"]
+    places: np.ndarray
+
+    @staticmethod
+    def whole(matrix) -> "StaticSparse":
+        """A matrix of which all entries can be other than zero."""
+        return StaticSparse(jnp.ravel(matrix), 1 + np.arange(matrix.size).reshape(matrix.shape))
+
+    @staticmethod
+    def stacked(parts: "list[StaticSparse]") -> "StaticSparse":
+        """Rows of several, in order."""
+        first = np.cumsum([0, *(len(part.values) for part in parts)])
+        places = [part.places + start * (part.places > 0) for part, start in zip(parts, first, strict=False)]
+        return StaticSparse(jnp.concatenate([part.values for part in parts]), np.concatenate(places))
+
+    def at(self, down, across):
+        """Entries, as NumPy reads them."""
+        nothing = jnp.zeros(1, self.values.dtype)
+        return jnp.concatenate([nothing, self.values])[self.places[down, across]]
+
+    def dense(self):
+        """All entries."""
+        return self.at(slice(None), slice(None))
+
+
+def products_of_pairs(left: np.ndarray, right: np.ndarray, a, b) -> StaticSparse:
+    """The matrix of a_i · b_j, vectors (k, d) and (n, d), with i in `left` and j in `right`; zero where i is -1."""
+    present = left >= 0
+    pairs, source = np.unique((left * len(b) + right)[present], return_inverse=True)
+    places = np.zeros(left.shape, dtype=int)
+    if _is_worth_it(len(pairs), len(a) * len(b)):
+        down, across = np.divmod(pairs, len(b))
+        places[present] = 1 + source
+        return StaticSparse(jnp.sum(a[down] * b[across], axis=-1), places)
+    places[present] = 1 + pairs[source]
+    return StaticSparse(jnp.ravel(a @ b.T), places)
+
+
+def _is_worth_it(read, entries):
+    return entries > LARGE and read <= SPARSE * entries
+
+
+def assembled(shape, parts, dtype):
+    """An array of zeros but for parts: (indices, values), the indices those of NumPy, one array for each axis."""
+    source = np.zeros(shape, dtype=int)
+    first = 1
+    for indices, values in parts:
+        source[indices] = first + np.arange(values.size).reshape(values.shape)
+        first += values.size
+    values = [jnp.ravel(values) for _, values in parts]
+    return StaticSparse(jnp.concatenate([jnp.zeros(0, dtype), *values]), source).dense()

@@ -1,0 +1,28 @@
+"""Newton's method and its like: iterate for as long as it helps."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jax import lax
+
+
+def while_falling(improve: Callable, begin, most: int, small, dtype):
+    """Iterate until what is missed is small, stops falling, or `most` iterations are done; once at least.
+
+    **Arguments:** `improve`: (state, what the iteration before missed, infinite at first) ↦ (state, what is missed);
+    `begin`: the first state; `dtype`: floating-point type of what is missed.
+
+    **Returns:** the last state.
+    """
+
+    def unfinished(carry):
+        count, _, missed, before = carry
+        return (count == 0) | ((count < most) & (missed > small) & (missed < before))
+
+    def iterate(carry):
+        count, state, before, _ = carry
+        state, missed = improve(state, before)
+        return count + 1, state, missed, before
+
+    infinite = jnp.asarray(jnp.inf, dtype)
+    return lax.while_loop(unfinished, iterate, (jnp.zeros((), int), begin, infinite, infinite))[1]

@@ -1,0 +1,1 @@
+"""What there is to say of a run: why it failed, what to watch, how far off it is."""

@@ -1,0 +1,198 @@
+"""Why a simulation failed: the elements to blame, found after the run."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.equations.configuration import configure
+from linkax.equations.dynamics import mass_matrix
+from linkax.equations.loops import gaps, jacobian, residual
+from linkax.equations.motion import move
+from linkax.equations.system import system_of
+from linkax.formulations.classical import ClassicalFormulation
+from linkax.formulations.constraint_split import ConstraintSplit
+from linkax.linalg.constrained_solve import invert
+from linkax.model.constraints import Drive
+from linkax.simulation.integrate.results import RESULTS
+from linkax.simulation.start.initial_state import MOVES, moving_joints
+from linkax.xla.derivatives import ratio
+
+AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
+OPEN_ULPS = 1e3  # that loops are open where constraints contradict each other
+LOST = 1e-9  # of an inertia: what is below leaves too few digits of double precision
+NULL = 1e-10  # eigenvalue of a mass matrix of ones
+
+
+def cause(solution) -> str:
+    """A sentence that names the elements at fault, or nothing where none is found.
+
+    **Arguments:** a failed `Solution`.
+    """
+    state = solution.run.state
+    system = system_of(solution.mechanism, state.q.dtype)
+    method = solution.run.tangent_space.prepared(state.q.dtype)
+    result, t = solution.result, solution.t_end
+    if result == RESULTS.not_finite:
+        return _not_finite(solution.mechanism) or _forces(solution, system, t, state) or _laws(solution.mechanism, t)
+    if result == RESULTS.not_closed:
+        return _open(system, solution.mechanism, t, method.close(system, t, state.q, state.v)[0])
+    if result == RESULTS.massless:
+        found = massless_bodies(system, method, t, state.q)
+        return f" They are {_listed(found)}." if found else lost_inertia(system)
+    if (result == RESULTS.no_branch) | (result == RESULTS.not_unique):
+        basis = ConstraintSplit.at(system, t, state.q, method.rank_tolerance).inverse.basis
+        return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
+    return (
+        _no_acceleration(solution, system, method, t)
+        or _drives(solution, system, t)
+        or _ahead(solution, system, t)
+        or _contradiction(solution, system, t)
+        or lost_inertia(system)
+    )
+
+
+def _listed(names):
+    return ", ".join(map(repr, names)) or "none"
+
+
+def _not_finite(mechanism):
+    for path, leaf in jax.tree_util.tree_flatten_with_path(mechanism)[0]:
+        if eqx.is_inexact_array(leaf) and not np.all(np.isfinite(leaf)):
+            place, which, *rest = path
+            owner = getattr(getattr(mechanism, place.name)[which.idx], "name", type(leaf).__name__)
+            return f" {owner!r}{jax.tree_util.keystr(rest)} is {np.asarray(leaf).tolist()}."
+    return ""
+
+
+def _forces(solution, system, t, state):
+    """Force elements whose load is not finite."""
+    motion = move(configure(system, jnp.asarray(t), state.q), state.v)
+    for force in solution.mechanism.forces:
+        load = force.applied(jnp.asarray(t), motion)
+        if not all(bool(jnp.all(jnp.isfinite(part))) for part in load):
+            return f" The load of {force.display_name} is not finite at t = {float(t):.6g} s."
+    return ""
+
+
+def _laws(mechanism, t):
+    """Constraints whose function of time, or its first two derivatives, is not finite."""
+    for constraint in mechanism.constraints:
+        rate = jax.jacfwd(constraint.right_side)
+        if not all(bool(jnp.isfinite(law(t))) for law in (constraint.right_side, rate, jax.jacfwd(rate))):
+            when = f"at t = {float(t):.6g} s"
+            return f" The function of {constraint.display_name}, or a derivative of it, is not finite {when}."
+    return ""
+
+
+def _ahead(solution, system, t):
+    """The same a little after the end of the run, where its last step failed."""
+    for ahead in AHEAD * float(jnp.max(jnp.abs(t)) + 1.0):
+        if found := _forces(solution, system, t + ahead, solution.end):
+            return found
+    return ""
+
+
+def _no_acceleration(solution, system, method, t):
+    """A classical formulation that finds no acceleration where the run ends."""
+    if not isinstance(solution.formulation, ClassicalFormulation):
+        return ""
+    end = solution.end
+    acceleration = solution.formulation.dynamics(system, t, end.q, end.v).acceleration
+    if np.all(np.isfinite(acceleration)):
+        return ""
+    rank, rows = int(np.sum(method.constraint_split(system, t, end.q).inverse.rank)), system.topology.num_rows
+    mass = "the mass matrix of the tree is singular"
+    why = f"{rank} of the {rows} loop rows are independent" if rank < rows else mass
+    return f" The formulation finds no finite acceleration there: {why}. The default formulation needs neither."
+
+
+def _drives(solution, system, t):
+    """Drives that ask for what the loops do not allow just after the end of the run."""
+    drives = [constraint for constraint in solution.mechanism.constraints if isinstance(constraint, Drive)]
+    method, end = solution.run.tangent_space.prepared(system.dtype, solution.rank_nearby), solution.end
+    small = jnp.sqrt(jnp.finfo(system.dtype).eps)
+    for ahead in AHEAD * float(jnp.abs(t) + 1.0) if drives else ():
+        q, _ = method.close(system, t + ahead, end.q, end.v)
+        if not float(jnp.max(jnp.abs(residual(configure(system, t + ahead, q))))) < small:
+            asked = [f"{drive.display_name} of joint {drive.joints[0]!r}" for drive in drives]
+            return f" The {' and the '.join(asked)} asks for what the loops do not allow after t = {float(t):.6g} s."
+    return ""
+
+
+def _contradiction(solution, system, t):
+    """Loops that stay open where a step failed, by more than rounding."""
+    end = solution.end
+    if solution.result != RESULTS.dt_min_reached or not system.topology.num_rows or not np.all(np.isfinite(end.q)):
+        return ""
+    name, size = _widest(system, solution.mechanism, t, end.q)
+    if size <= OPEN_ULPS * jnp.finfo(system.dtype).eps:
+        return ""
+    return (
+        f" Joint {name!r} stays open by {size:.3g}, in radians or lengths of the mechanism: constraints that are "
+        "nearly redundant contradict each other by so much. Correct lengths and axes, or ask for a tolerance (rtol) "
+        "above it."
+    )
+
+
+def _open(system, mechanism, t, q):
+    """Where the loops are open."""
+    name, size = _widest(system, mechanism, t, q)
+    return f" Joint {name!r} is open by {size:.3g}, in radians or lengths of the mechanism."
+
+
+def _widest(system, mechanism, t, q):
+    """The joint or constraint at which the loops are widest open, and by how much."""
+    gap, topology = gaps(configure(system, t, q)).in_scales(system), mechanism.topology
+    names = [*topology.joints[topology.num_bodies :], *topology.constraints]
+    sizes = np.concatenate([np.maximum(gap.distance, gap.angle), gap.constraints])
+    widest = int(np.argmax(sizes))
+    return names[widest], float(sizes[widest])
+
+
+def lost_inertia(system, below=LOST):
+    """A body of which rounding leaves little in the inertia about its joint, next to what it carries far out."""
+    topology, carrier = system.topology, np.array(system.topology.predecessor)
+    offsets = np.stack([system.parent_offset, system.child_offset], axis=1)[: topology.num_bodies]
+    near = np.where(topology.reversed, 1, 0)  # the joint's end on the carrier
+    moved = np.arange(topology.num_bodies)
+    on_carrier, on_itself = offsets[moved, near], offsets[moved, 1 - near]
+    about_joint = lambda place: np.sum((system.center_of_mass - place) ** 2, axis=-1) * system.mass
+    inertia = np.max(np.abs(system.inertia), axis=(1, 2)) + about_joint(on_itself)
+    # Joints that bend have arms that are no constants.
+    straight = np.array([kind.motion is None for kind in topology.joint_types[: topology.num_bodies]])
+    carried = np.flatnonzero((carrier >= 0) & (inertia > 0.0) & straight)
+    arms = np.sum((on_carrier - on_itself[carrier]) ** 2, axis=-1)
+    # What is carried resists the carrier with its mass alone.
+    left = (inertia[carrier] + system.mass * arms)[carried] / inertia[carried]
+    carried, left = carried[left > 0.0], left[left > 0.0]  # what has no inertia loses none
+    if not len(carried) or not np.min(left) < below:
+        return ""
+    body = carried[np.argmin(left)]
+    names = topology.bodies[carrier[body]], topology.bodies[body], topology.joints[body]
+    digits = max(0, round(float(np.log10(np.min(left) / jnp.finfo(system.dtype).eps + 1e-300))))
+    return (
+        f" Rounding leaves {digits} digits of the inertia of body {names[0]!r} next to that of {names[1]!r}, which it "
+        f"carries in the tree; in a loop, cut=True on joint {names[2]!r} lets another body carry it."
+    )
+
+
+def massless_bodies(system, method, t, q):
+    """Bodies that can move without moving any mass: magnitudes of masses do not matter, so all are one."""
+    moment = jnp.max(jnp.abs(system.inertia), axis=(1, 2))
+    inertia = ratio(system.inertia, moment[:, None, None], 0.0) * system.length**2
+    equal = eqx.tree_at(lambda s: (s.mass, s.inertia), system, (ratio(system.mass, system.mass, 0.0), inertia))
+    configuration = configure(equal, t, q)
+    basis = invert(None, jacobian(configuration), system.scales, method.rank_tolerance).basis
+    basis = np.asarray(basis)[:, np.any(np.asarray(basis) != 0.0, axis=0)]
+    values, vectors = np.linalg.eigh(basis.T @ np.asarray(mass_matrix(configuration)) @ basis / system.length**2)
+    directions = basis @ vectors[:, values < NULL]
+    found = []
+    for direction in directions.T:
+        motion = move(configuration, jnp.asarray(direction))
+        speed = np.linalg.norm(motion.angular_velocity[:-1], axis=1)
+        speed += np.linalg.norm(motion.velocity[:-1], axis=1) / float(system.length)
+        found += [
+            name for name, moves in zip(system.topology.bodies, speed > MOVES * np.max(speed), strict=True) if moves
+        ]
+    return list(dict.fromkeys(found))

@@ -1,0 +1,62 @@
+"""A run once more: more accurately, which tells how far off it is, or a part of it."""
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.simulation.integrate.options import with_tolerances
+from linkax.simulation.integrate.run import DEFAULT_SAVES, Run, cast
+from linkax.simulation.start.state import State
+
+FINEST = 1e-13  # tolerance
+REFINED_STEPS = 4  # as many as in the run before
+FEWEST = 51  # saved times, with fewer of which a part is saved at the default ones
+
+
+def refined_run(solution, factor) -> Run:
+    """The run of a solution in double precision, at `factor` times its tolerances, or at half its steps.
+
+    **Raises:** `ValueError` for steps that cannot be refined.
+    """
+    run = solution.run
+    options, accuracy, dt0 = run.options, run.accuracy, run.options.dt0
+    if isinstance(run.control.innermost, diffrax.ConstantStepSize) and dt0 is not None:
+        dt0 = 0.5 * dt0
+    elif not run.control.is_adaptive:
+        raise ValueError(f"steps of {type(options.controller).__name__} cannot be refined; use an adaptive controller")
+    finer = lambda rtol: jnp.maximum(factor * rtol, FINEST)
+    controller, accuracy = with_tolerances(finer, (options.controller, accuracy))
+    mechanism, state, t0, accuracy = cast((run.mechanism, run.state, run.t0, accuracy), jnp.dtype(float))
+    ts = jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)
+    return run.changed(
+        mechanism=mechanism,
+        state=state,
+        t0=t0,
+        t1=solution.t_end,
+        accuracy=accuracy,
+        saveat=diffrax.SaveAt(ts=ts),
+        controller=controller,
+        dt0=dt0,
+        max_steps=None if options.max_steps is None else REFINED_STEPS * options.max_steps,
+    )
+
+
+def part_of_run(solution, state: State, ts) -> Run:
+    """The motion from a state at the first of some times to the last, saved there, with the same options.
+
+    By the same program where the run of the solution saves as many.
+    """
+    padded = np.pad(ts, (0, num_saves(solution) - len(ts)), mode="edge")
+    return solution.run.changed(state=state, t0=ts[0], t1=ts[-1], saveat=diffrax.SaveAt(ts=padded))
+
+
+def num_saves(solution) -> int:
+    """States that a part of a run saves at most."""
+    saves_times = solution.run.options.saveat is not None
+    return len(solution.ts) if saves_times and len(solution.ts) >= FEWEST else DEFAULT_SAVES
+
+
+def has_parts(solution) -> bool:
+    """Whether a part of the motion can be run by itself: not where steps are given, nor for a single state."""
+    run = solution.run
+    return run.is_integrated and not isinstance(run.control.innermost, diffrax.StepTo)

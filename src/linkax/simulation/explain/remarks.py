@@ -1,0 +1,207 @@
+"""What there is to say of a simulation that ended well: see `linkax.REMARKS`, and why, with the elements to blame."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.equations.configuration import along_speeds, configure
+from linkax.equations.coordinates import retract
+from linkax.equations.motion import move
+from linkax.equations.system import system_of
+from linkax.linalg.spectral_radius import spectral_radius
+from linkax.linalg.triangular import cholesky_inverse
+from linkax.simulation.explain.diagnosis import lost_inertia
+from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS
+from linkax.xla.enumerations import code, item
+from linkax.xla.tracing import all_concrete, quick_compile
+
+UNSEEN = 10.0  # tolerances: rounding of accelerations that adds little to the errors of steps
+UNSEEN_ULPS = 1e5
+TO_BLAME = 100.0  # times the definiteness of the mass matrix: share of an inertia that explains it
+LINGERS = 3e-5  # mean distance from a singular configuration of a motion that does not leave it
+STAYS_ULPS = 8.0  # the same of what stands still in it
+PASSES = 3e-2  # distance from a singular configuration that branches are told apart from in single precision
+MANY_STEPS = 1000
+SHORT = 3e-2  # what the motion turns, or moves in lengths of the mechanism, in a mean step that it does not choose
+FAST = 0.5  # rate of an element that chooses the steps, times their mean length
+RESOLVED = 5.0  # the same, below which an explicit solver takes about as many steps: Dopri8's reach 2 to 3
+
+
+def remark(solution) -> REMARKS:
+    """What there is to say of a run that ended well, or of each of a batch: the first of `REMARKS` that applies."""
+    known, found = _known(solution), np.zeros(solution.t_end.shape, np.int32)
+    numeric = np if known is np.asarray else jnp
+    if solution.run.is_integrated:
+        well = numeric.isin(known(code(solution.result)), _WELL)
+        for name, (applies, _) in reversed(_FINDINGS.items()):
+            found = numeric.where(well & applies(solution, known), code(getattr(REMARKS, name)), found)
+    # An entry of an array of NumPy would be none of an enumeration.
+    return item(jnp.asarray(found, jnp.int32) if found.shape else found, REMARKS)
+
+
+def in_words(solution, *names) -> str:
+    """The first of these `REMARKS` that applies to a run, ended well or not, with numbers and elements; or nothing."""
+    for applies, tell in map(_FINDINGS.get, names):
+        if applies(solution, np.asarray):
+            return tell(solution)
+    return ""
+
+
+def _known(solution):
+    """Numbers of a run as NumPy's, which compile nothing, unless they are traced."""
+    found = solution.t_end, solution.v, solution.stats, solution.result, solution.average, solution.definiteness
+    return np.asarray if all_concrete(found) else jnp.asarray
+
+
+def _loses_accuracy(solution, known):
+    """Whether rounding keeps accelerations from the tolerance."""
+    definiteness, eps = known(solution.definiteness), jnp.finfo(solution.definiteness.dtype).eps
+    seen = UNSEEN_ULPS * definiteness < 1.0
+    if known is np.asarray and not np.any(seen):
+        return seen
+    return seen & (eps > UNSEEN * definiteness * known(_rtol(solution)))
+
+
+def _rtol(solution):
+    rtol, _ = solution.run.control.tolerances((solution.accuracy.rtol, None))
+    return rtol
+
+
+def _lost_accuracy(solution):
+    definiteness, rtol = float(solution.definiteness), float(_rtol(solution))
+    system = system_of(solution.mechanism, solution.definiteness.dtype)
+    why = lost_inertia(system, below=TO_BLAME * definiteness)
+    many = " Some bodies carry others far larger, or very many; ask for a larger rtol."
+    rounding = jnp.finfo(system.dtype).eps / definiteness
+    off = f" Rounding alone puts accelerations off by {rounding:.0e} of their size, and rtol is {rtol:.0e}."
+    return off + (why or many)
+
+
+def _passes(solution, known):
+    """Whether branches cross closer than single precision tells them apart."""
+    closest = known(solution.closest)
+    return (closest < PASSES) & (jnp.finfo(closest.dtype).bits < 64)
+
+
+def _passed(solution):
+    return (
+        f" The motion passes a singular configuration, where branches of motion cross, at a distance of "
+        f"{float(solution.closest):.0e}: rounding of single precision may move it to another; compare with double "
+        "precision."
+    )
+
+
+def _lingers(solution, known):
+    """Whether rounding may confuse the branches that the motion is close to all the time."""
+    average = known(solution.average)
+    return (average > STAYS_ULPS * jnp.finfo(average.dtype).eps) & (average < LINGERS)
+
+
+def _lingered(solution):
+    return (
+        f" The motion does not leave a singular configuration, where branches of motion cross, by more than about "
+        f"{float(solution.average):.0e}: rounding may move it from one to another, which puts it off by more than that."
+    )
+
+
+def _is_stiff(solution, known):
+    """Whether the rate of an element, and not the motion, chooses the steps; rates are found where steps are many."""
+    never = np.zeros(solution.t_end.shape, bool)
+    suspect = known(solution.stats["num_steps"]) >= MANY_STEPS
+    if solution.v is None or not solution.mechanism.forces or (known is np.asarray and not np.any(suspect)):
+        return never
+    if not solution.run.control.is_adaptive:
+        return never
+    step = known(_mean_step(solution))
+    suspect = suspect & (known(_mean_speed(solution)) * step < SHORT)
+    if known is np.asarray and not np.any(suspect):
+        return never
+    turned = known(jnp.max(_rates(*_ends(solution)), axis=-1)) * step
+    is_implicit = isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver)
+    return suspect & (turned > FAST) & (turned < (RESOLVED if is_implicit else np.inf))
+
+
+def _stiff(solution):
+    rates, step = np.asarray(_rates(*_ends(solution))), float(_mean_step(solution))
+    fastest = int(np.argmax(rates))
+    explicit = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
+    rigid = (
+        "take a rigid joint or constraint in its place, or, where it has come to rest or the tolerance is loose, "
+        "solver=diffrax.Kvaerno5()"
+    )
+    advice = explicit if isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver) else rigid
+    return (
+        f" {solution.mechanism.forces[fastest].display_name}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not "
+        f"the motion, chooses the {int(solution.stats['num_steps'])} steps, {step:.1e} s each; {advice}."
+    )
+
+
+_WELL = np.array([code(getattr(RESULTS, name)) for name in ENDED_WELL])
+# Of each of `REMARKS`, the first to be told first: whether it applies, and what there is to say.
+_FINDINGS = {
+    "rounding": (_loses_accuracy, _lost_accuracy),
+    "single_precision": (_passes, _passed),
+    "lingers": (_lingers, _lingered),
+    "stiff": (_is_stiff, _stiff),
+}
+
+
+def _mean_step(solution):
+    return (solution.t_end - solution.run.t0) / jnp.maximum(solution.stats["num_steps"], 1)
+
+
+def _mean_speed(solution):
+    """Of the fastest joint, over saved times; not a number where none was reached."""
+    scales = _per_member(_scales, *_ends(solution))
+    turns, reached = (
+        jnp.max(jnp.abs(solution.v / scales[..., None, :]), axis=-1, initial=0.0),
+        jnp.isfinite(solution.ts),
+    )
+    return jnp.sum(jnp.where(reached, turns, 0.0), axis=-1) / jnp.sum(reached, axis=-1)
+
+
+def _ends(solution):
+    return solution.mechanism, solution.run.tangent_space, solution.t_end, solution.end
+
+
+def _per_member(function, mechanism, tangent_space, t, state):
+    """Of what is at the end of a run, or of each of a batch."""
+    for _ in range(t.ndim):
+        function = eqx.filter_vmap(function)
+    return function(mechanism, tangent_space, t, state)
+
+
+def _scales(mechanism, tangent_space, t, state):
+    return system_of(mechanism, state.q.dtype).scales
+
+
+@quick_compile
+def _rates(mechanism, tangent_space, t, state):
+    """The fastest rate of each force element [1/s], (..., n): √(k / m) or c / m."""
+    return _per_member(_rates_of_elements, mechanism, tangent_space, t, state)
+
+
+def _rates_of_elements(mechanism, tangent_space, t, state):
+    gram, *matrices = _elements(mechanism, tangent_space, t, state)
+    stays = jnp.diagonal(gram) <= 0.0
+    to_speeds, _ = cholesky_inverse(gram + jnp.diag(stays.astype(gram.dtype)))
+    largest = lambda of: spectral_radius(to_speeds @ of @ to_speeds.T)
+    stiffness, damping = map(largest, matrices)
+    return jnp.maximum(jnp.sqrt(stiffness), damping)
+
+
+def _elements(mechanism, tangent_space, t, state):
+    """Masses in directions that the loops leave, stiffness and damping there of each force element, (n, n_v, n_v)."""
+    system = system_of(mechanism, state.q.dtype)
+    found = tangent_space.prepared(system.dtype).at_rest(system, t, state.q)
+    basis, still = found.split.inverse.basis, jnp.zeros_like(state.v)
+
+    def forces(change, faster):
+        motion = move(configure(system, t, retract(system.topology, state.q, basis @ change)), state.v + basis @ faster)
+        loads = [force.applied(t, motion) for force in mechanism.forces]
+        along = lambda load: load.joint_force + along_speeds(motion.configuration, load.force, load.moment)
+        return jnp.stack([along(load) @ basis for load in loads])
+
+    return basis.T @ found.mass @ basis, *jax.jacfwd(forces, (0, 1))(still, still)

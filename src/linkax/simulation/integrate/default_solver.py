@@ -1,0 +1,31 @@
+"""Which solver integrates a mechanism where none is asked for."""
+
+import diffrax
+import jax.numpy as jnp
+
+from linkax.model.mechanism import Mechanism
+from linkax.xla.tracing import all_concrete
+
+CRITICAL = 2.0  # frequency times damping: waves that do not turn any more
+LOOSE = 1e-5  # tolerance
+LONG = 2**15  # radians of the fastest wave: an explicit step takes 2 to 3, and a run 2**16 steps by default
+
+
+def default_solver(mechanism: Mechanism, rtol, duration) -> diffrax.AbstractSolver:
+    """`Dopri8`, or for some mechanisms with beams `Kvaerno5`, implicit, whose steps fast waves do not choose.
+
+    Of undamped waves an implicit solver has to follow those that the motion excites as an explicit one does, with lower
+    order and at ten times the cost of a step. It is better where they are damped faster than they turn, where the
+    tolerance is loose, and in runs so long that they keep an explicit one from their end.
+
+    **Arguments:** `rtol`: tolerance of a step, None for fixed steps; `duration` [s]. Where these or numbers of beams
+    are traced by JAX, beams get `Kvaerno5`.
+    """
+    if not mechanism.beams:
+        return diffrax.Dopri8()
+    frequencies = jnp.stack([beam.fastest_frequency for beam in mechanism.beams])
+    dampings = jnp.stack([jnp.asarray(beam.damping) for beam in mechanism.beams])
+    if rtol is None or not all_concrete((rtol, duration, frequencies, dampings)):
+        return diffrax.Kvaerno5()
+    damped, long = jnp.any(frequencies * dampings > CRITICAL), jnp.max(frequencies) * duration > LONG
+    return diffrax.Kvaerno5() if rtol >= LOOSE or damped or long else diffrax.Dopri8()

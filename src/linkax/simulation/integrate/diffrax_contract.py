@@ -1,0 +1,72 @@
+"""What diffrax is given that it does not expect, behind names.
+
+diffrax integrates one vector y, takes one error estimate of it, and hands a solver's state from step to step unread.
+linkax tells a step control more: how close the stages of a step came to a singular configuration. It does so
+
+- in y, whose last entry is ∫ d dt, d the distance from the nearest singular configuration: the rates of that entry at
+  the stages are d there, and its end value the mean;
+- in the error, which is a `StepError` where diffrax has a vector like y: only `MechanismControl` reads it;
+- in the solver's state, which is a `SolverState`: the saved one tells the smallest d of all stages.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+
+class StepError(NamedTuple):
+    """What `ProjectedSolver` tells `MechanismControl` of a step.
+
+    - `error`: estimate of q and v, or None.
+    - `leaves`: distance d from the nearest singular configuration where the step begins.
+    - `passes`: the smallest d of its other stages. `retry`: by how much to change the step so that
+      what passes there falls between two stages.
+    - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
+      past, one for none; None where there are none.
+    """
+
+    error: Any
+    leaves: Float[Array, ""]
+    passes: Float[Array, ""]
+    retry: Float[Array, ""]
+    switch: Float[Array, ""] | None = None
+
+
+class SolverState(NamedTuple):
+    """The state of the solver inside, d at the end of the last step, and the smallest d so far at any stage."""
+
+    inner: Any
+    arrives: Float[Array, ""]
+    closest: Float[Array, ""]
+
+
+def pack(sides, q, v, integral):
+    """The vector y that diffrax integrates: sides of switches, if any, q, v, and ∫ d dt; or its rates."""
+    first = [sides] if len(sides) else []
+    return jnp.concatenate([*first, q, v, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
+
+
+def unpack(topology, y):
+    """Sides, q and v of vectors y, (..., k + n_q + n_v + 1)."""
+    first = y.shape[-1] - topology.num_coordinates - topology.num_speeds - 1
+    middle = first + topology.num_coordinates
+    return y[..., :first], y[..., first:middle], y[..., middle:-1]
+
+
+def integral_of_distance(y):
+    """∫ d dt of a vector y."""
+    return y[..., -1]
+
+
+def stage_distances(dense_info, duration, solver):
+    """d at the stages of a Runge-Kutta step, whose increments `k` diffrax keeps to interpolate; None for others."""
+    if not (isinstance(dense_info, dict) and "k" in dense_info and hasattr(solver, "tableau")):
+        return None
+    return lax.stop_gradient(dense_info["k"][:, -1] / duration)
+
+
+def closest(solution) -> Float[Array, ""]:
+    """The smallest d at any stage of a diffrax solution that saved the solver's state."""
+    return solution.solver_state.closest

@@ -1,0 +1,175 @@
+"""diffrax's integration of an initial value problem, differentiated by its accepted steps in both modes."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from linkax.simulation.integrate import diffrax_contract
+from linkax.simulation.integrate.problem import derivative
+from linkax.simulation.integrate.projected_solver import ProjectedSolver
+from linkax.simulation.integrate.step_control import MechanismControl
+from linkax.simulation.integrate.step_derivatives import (
+    InitialValueProblem,
+    Steps,
+    Trajectory,
+    cotangents_over_steps,
+    tangents_over_steps,
+)
+from linkax.xla.derivatives import materialise
+from linkax.xla.primitives import primitive
+
+NO_REVERSE = (
+    "Reverse-mode derivatives of reverse-mode derivatives of a simulation do not exist. Take second derivatives "
+    "forwards: jax.jacfwd(jax.jacfwd(loss)), or jax.jvp(jax.grad(loss), ...) for a Hessian times a vector."
+)
+
+
+class Integrator(eqx.Module):
+    """What `diffrax.diffeqsolve` is given beside an initial value problem."""
+
+    dt0: Any
+    saveat: diffrax.SaveAt
+    solver: ProjectedSolver
+    controller: MechanismControl
+    adjoint: diffrax.AbstractAdjoint
+    event: diffrax.Event | None
+    progress_meter: diffrax.AbstractProgressMeter
+    max_steps: int | None = eqx.field(static=True)
+
+
+class Found(NamedTuple):
+    """What an integration leaves: times and values saved, those at its end, and how it ended.
+
+    `closest`, `average`: the smallest and the mean distance from a singular configuration.
+    """
+
+    ts: Any
+    ys: Any
+    t_end: Float[Array, ""]
+    y_end: Float[Array, " n"]
+    stats: dict
+    result: Any
+    closest: Float[Array, ""]
+    average: Float[Array, ""]
+    interpolation: Any
+
+
+def has_discrete_adjoint(solver, saveat, event, max_steps) -> bool:
+    """Whether a run is differentiated here: explicit Runge-Kutta steps, saved states and no event."""
+    plain = isinstance(saveat.subs, diffrax.SubSaveAt) and not saveat.subs.steps and not saveat.dense
+    explicit = isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau)
+    return plain and explicit and event is None and max_steps is not None
+
+
+def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bool):
+    """Solve an initial value problem; what derivatives there are, are those of diffrax's adjoint.
+
+    **Returns:** a `Found`, and its `Steps` if they are to be tracked, else None.
+    """
+    end, steps = diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t0=True, steps=True)
+    saveat = integrator.saveat
+    if ivp.saved is not None:
+        saveat = eqx.tree_at(lambda s: s.subs.ts, saveat, ivp.saved)
+    saveat = eqx.tree_at(
+        lambda s: (s.subs, s.solver_state),
+        saveat,
+        ((saveat.subs, end, steps) if track else (saveat.subs, end), True),
+        is_leaf=lambda leaf: leaf is None,
+    )
+    found = diffrax.diffeqsolve(
+        diffrax.ODETerm(derivative),
+        integrator.solver,
+        ivp.t0,
+        ivp.t1,
+        integrator.dt0,
+        ivp.y0,
+        ivp.problem,
+        saveat=saveat,
+        stepsize_controller=integrator.controller,
+        adjoint=integrator.adjoint,
+        event=integrator.event,
+        max_steps=integrator.max_steps,
+        throw=False,
+        progress_meter=integrator.progress_meter,
+    )
+    (ts, t_end, *times), (ys, y_end, *states) = found.ts, found.ys
+    average = lax.stop_gradient(diffrax_contract.integral_of_distance(y_end[0]) / (t_end[0] - ivp.t0))
+    closest = diffrax_contract.closest(found)
+    tracked = Steps(times[0], states[0], found.stats["num_accepted_steps"]) if track else None
+    end = t_end[0], y_end[0], found.stats, found.result
+    return Found(ts, ys, *end, closest, average, found.interpolation), tracked
+
+
+# The same with the derivatives of `tangents_over_steps`, in both modes: of `ts`, `t_end`, `ys` and `y_end`.
+integrate = eqx.filter_custom_jvp(solve_by_diffrax)
+
+
+@integrate.def_jvp
+def _integrate_jvp(primals, tangents):
+    """The tangents of states, and of tracked steps, which derivatives of cotangents need."""
+    (ivp, integrator, track), (tangents, *_) = primals, tangents
+    found, steps = integrate(ivp, integrator, True)
+    # In one array, which is one of a batch where anything is: JAX could not transpose a batch with parts in common.
+    flat, restored = ravel_pytree(tangents)
+    flat = flat + (steps.count < 0)
+    trajectory = _tangents(integrator.solver, track, ivp, steps, restored, flat)
+    begin, end = materialise(ivp.t0, tangents.t0), materialise(ivp.t1, tangents.t1)
+    saved = None if ivp.saved is None else materialise(ivp.saved, tangents.saved)
+    row_by_row = lambda *parts: _rows(integrator.saveat.subs, *parts)
+    nothing = jax.tree.map(lambda _: None, found)
+    to_found = nothing._replace(
+        ts=row_by_row(begin, saved, end),
+        # The end's time is t1, unless the integration ended before.
+        t_end=jnp.where(found.t_end == ivp.t1, end, 0.0),
+        ys=row_by_row(materialise(ivp.y0, tangents.y0), trajectory.saved, trajectory.end),
+        y_end=trajectory.end,
+    )
+    if not track:
+        return (found, None), (to_found, None)
+    to_times = jnp.zeros_like(steps.ts).at[steps.count].set(end).at[0].set(begin)
+    return (found, steps), (to_found, Steps(to_times, trajectory.steps, None))
+
+
+def _rows(sub, y0, saved, end):
+    """What diffrax saves, of values at the start, at saved times, and at the end."""
+    parts = [y0[None]] * sub.t0 + [saved] * (sub.ts is not None) + [end[None]] * sub.t1
+    return jnp.concatenate(parts)
+
+
+# `tangents_over_steps` as a primitive, linear in its last argument, the tangents in one array: only so can one function
+# have a forward and a backward rule.
+
+
+def _evaluate(solver, every, ivp, steps, restored, flat):
+    return tangents_over_steps(solver, every, ivp, steps, restored(flat))
+
+
+def _abstract(solver, every, ivp, steps, restored, flat):
+    n = ivp.y0.shape
+    of = lambda shape: jax.core.ShapedArray(shape, ivp.y0.dtype)
+    saved = None if ivp.saved is None else of(ivp.saved.shape + n)
+    return Trajectory(saved, of(n), of(steps.ys.shape) if every else None)
+
+
+def _jvp(primals, tangents):
+    return eqx.filter_jvp(_evaluate, primals, tangents)
+
+
+def _transpose(inputs, cotangent):
+    solver, every, ivp, steps, restored, flat = inputs
+    if every:
+        raise NotImplementedError(NO_REVERSE)
+    tangents = jax.eval_shape(restored, flat.aval)
+    wanted = jax.tree.map(lambda tangent: tangent is not None, tangents, is_leaf=lambda leaf: leaf is None)
+    found, _ = ravel_pytree(cotangents_over_steps(solver, ivp, steps, wanted, cotangent))
+    none = lambda tree: jax.tree.map(lambda _: None, tree)
+    return none(solver), none(every), none(ivp), none(steps), None, found
+
+
+_tangents = primitive("discrete_adjoint", _evaluate, _abstract, _jvp, _transpose)

@@ -1,0 +1,182 @@
+"""The compiled programs of a run: check its start, integrate, close what was saved."""
+
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from linkax.equations.system import system_of
+from linkax.simulation.integrate.discrete_adjoint import Found, Integrator, integrate, solve_by_diffrax
+from linkax.simulation.integrate.map_saved_times import map_saved_times
+from linkax.simulation.integrate.options import saved_times, saves_times
+from linkax.simulation.integrate.problem import Problem
+from linkax.simulation.integrate.projected_solver import ProjectedSolver
+from linkax.simulation.integrate.results import ENDED_WELL, RESULTS
+from linkax.simulation.integrate.run import SAVE_STATE, Run, cast, saves_states
+from linkax.simulation.integrate.step_derivatives import InitialValueProblem
+from linkax.simulation.integrate.switches import start_sides
+from linkax.simulation.start.initial_state import InitialCheck, check_initial_state
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import sound_numbers
+from linkax.xla.tracing import Program, concrete, quick_compile
+from linkax.xla.undefined import undefined_where
+
+
+class Outcome(NamedTuple):
+    """What a run leaves: the check of its start, what was found, and states on the loops at the end and as saved."""
+
+    initial: InitialCheck
+    found: Found
+    end: State
+    saved: State | None
+
+
+def integrate_run(run: Run) -> Outcome:
+    """Integrate a run, in three programs: another solver, formulation or saveat compiles no more than it must."""
+    initial = _check_start(run.mechanism, run.state, run.t0, run.tangent_space)
+    if concrete(sound := sound_numbers(run.mechanism)) is None:
+        initial = initial.of_numbers(sound)
+    found = _integrate.choose(run.quick, run, initial)(run, initial)
+    saveat = run.options.saveat
+    given = (found.ts, found.t_end), (found.ys, found.y_end), saves_states(saveat), _firsts(saveat)
+    given = run.mechanism, run.formulation, run.accuracy, initial, *given
+    return Outcome(initial, found, *_closed.choose(run.quick, *given)(*given))
+
+
+@quick_compile
+def _check_start(mechanism, state, t0, tangent_space) -> InitialCheck:
+    dtype = state.q.dtype
+    return check_initial_state(tangent_space.prepared(dtype), system_of(mechanism, dtype), t0, state)
+
+
+def problem_of(mechanism, formulation, accuracy, initial: InitialCheck) -> Problem:
+    """The initial value problem's right-hand side from a state that was checked."""
+    dtype = initial.state.q.dtype
+    start = initial.can_start, initial.t, initial.singular
+    return Problem(mechanism, system_of(mechanism, dtype), formulation.prepared(dtype, initial.rank), accuracy, *start)
+
+
+@Program
+def _integrate(run: Run, initial: InitialCheck) -> Found:
+    dtype = initial.state.q.dtype
+    formulation, t0, t1, options, control = cast((run.formulation, run.t0, run.t1, run.options, run.control), dtype)
+    in_order, t0, t1, dt0, saveat = _in_order(t0, t1, options.dt0, options.saveat)
+    problem = problem_of(run.mechanism, formulation, run.accuracy, initial)
+    problem = eqx.tree_at(lambda p: p.can_start, problem, problem.can_start & in_order)
+    inputs = run.mechanism, initial.state, t0, t1, dt0, saveat
+    if not saves_states(saveat):
+        saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))
+    q, v = initial.state.q, initial.state.v
+    sides = start_sides(problem.system, t0, q, v) if control.is_adaptive else ()
+    y0, event = problem.packed(q, v, sides), _wrapped_event(options.event)
+    solver = ProjectedSolver.around(options.solver, run.accuracy, run.adjoint, control)
+    meter = diffrax.NoProgressMeter() if options.progress_meter is None else options.progress_meter
+    integrator = Integrator(dt0, saveat, solver, control, run.adjoint, event, meter, options.max_steps)
+    saved = saveat.subs.ts if run.has_discrete_adjoint else None
+    solve = integrate if run.has_discrete_adjoint else solve_by_diffrax
+    found, _ = solve(InitialValueProblem(problem, y0, t0, t1, saved), integrator, False)
+    found = found._replace(result=_result(found.result, initial, in_order, control.is_adaptive))
+    return _without_derivatives(found, event, inputs)
+
+
+def _in_order(t0, t1, dt0, saveat):
+    """Whether traced times make sense, and the times: where they do not, others, from which no step is taken.
+
+    diffrax would raise from inside a program, and for all members of a batch.
+    """
+    right = jnp.isfinite(t0) & (t1 > t0) & jnp.isfinite(t1)
+    right = right if dt0 is None else right & jnp.isfinite(dt0) & (dt0 > 0.0)
+    subs = saved_times(saveat)
+    for ts in subs:
+        right = right & jnp.all(jnp.isfinite(ts)) & jnp.all(jnp.diff(ts) >= 0.0) & (ts[0] >= t0) & (ts[-1] <= t1)
+    either = lambda given, other: jnp.where(right, given, other)
+    if subs:
+        saveat = eqx.tree_at(saved_times, saveat, [jnp.where(right, ts, jnp.zeros_like(ts)) for ts in subs])
+    zero = jnp.zeros_like(t0)
+    return right, either(t0, zero), either(t1, zero + 1.0), None if dt0 is None else either(dt0, zero + 1.0), saveat
+
+
+class _OnManifold(eqx.Module):
+    """A user's function of (t, state, mechanism), for diffrax: the state is closed first."""
+
+    function: callable
+
+    def __call__(self, t, y, args, **unused):  # diffrax passes `args` by name where it seeks the root of an event
+        return self.function(t, args.close(t, y), args.mechanism)
+
+
+def _wrapped_saves(subs):
+    is_sub = lambda node: isinstance(node, diffrax.SubSaveAt)
+    wrap = lambda sub: eqx.tree_at(lambda s: s.fn, sub, _OnManifold(_state_itself if sub.fn is SAVE_STATE else sub.fn))
+    return jax.tree.map(wrap, subs, is_leaf=is_sub)
+
+
+def _state_itself(t, state, mechanism):
+    return state
+
+
+def _wrapped_event(event):
+    if event is None:
+        return None
+    return eqx.tree_at(lambda e: e.cond_fn, event, jax.tree.map(_OnManifold, event.cond_fn, is_leaf=callable))
+
+
+def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptive: bool):
+    """The first of what is wrong at the start, else how the integration ended."""
+    result = RESULTS.promote(result)
+    if not is_adaptive:
+        result = RESULTS.where(result == RESULTS.dt_min_reached, RESULTS.diverged, result)
+    result = RESULTS.where(initial.unique, result, RESULTS.not_unique)
+    result = RESULTS.where(initial.on_branch, result, RESULTS.no_branch)
+    result = RESULTS.where(initial.closed, result, RESULTS.not_closed)
+    result = RESULTS.where(initial.massive, result, RESULTS.massless)
+    result = RESULTS.where(initial.finite, result, RESULTS.not_finite)
+    result = RESULTS.where(initial.assembled, result, RESULTS.not_assembled)
+    return RESULTS.where(in_order, result, RESULTS.times_out_of_order)
+
+
+def _without_derivatives(found: Found, event, inputs) -> Found:
+    """The same without derivatives where the run failed, or ended with a step that an event ended."""
+    failed = jnp.logical_not(jnp.stack([found.result == getattr(RESULTS, name) for name in ENDED_WELL]).any())
+    at_end = failed
+    if event is not None and event.root_finder is None:
+        at_end = failed | (found.result == RESULTS.event_occurred)
+    of_times = lambda ts: failed | (at_end & (ts >= found.t_end))
+    of_values = lambda ts, ys: jax.tree.map(lambda y: of_times(ts).reshape(-1, *(1,) * (y.ndim - 1)), ys)
+    values, fixed = eqx.partition((found.ts, found.ys, found.t_end, found.y_end), eqx.is_inexact_array)
+    undefined = (
+        jax.tree.map(of_times, values[0]),
+        jax.tree.map(of_values, values[0], values[1]),
+        at_end,
+        at_end,
+    )
+    values = undefined_where(undefined, values, eqx.filter(inputs, eqx.is_inexact_array))
+    ts, ys, t_end, y_end = eqx.combine(values, fixed)
+    return found._replace(ts=ts, ys=ys, t_end=t_end, y_end=y_end)
+
+
+def _firsts(saveat):
+    """For each saved time the first row of that time, which may come more than once; None where times are traced."""
+    ts = concrete(saveat.subs.ts) if saves_times(saveat) else None
+    return None if ts is None else np.searchsorted(ts, ts)
+
+
+@Program
+def _closed(mechanism, formulation, accuracy, initial, times, values, saves, firsts) -> tuple[State, State | None]:
+    """The state at the end, and those that are saved, on the loops; infinite where none was saved."""
+    problem = problem_of(mechanism, formulation, accuracy, initial)
+    (ts, t_end), (ys, y_end) = times, values
+    if not saves:
+        return problem.close(t_end, y_end), None
+    # The end comes first, so that it is in the same part as times that were saved.
+    saved = jnp.isfinite(ts)
+    once = saved if firsts is None else saved & (firsts == jnp.arange(len(ts)))
+    rows = [jnp.concatenate(parts) for parts in ((jnp.ones(1, bool), once), (t_end[None], ts), (y_end[None], ys))]
+    closed = map_saved_times(problem.close, *rows)
+    each = lambda rows: rows[1:] if firsts is None else rows[1:][firsts]
+    later = lambda rows: jnp.where(saved[:, None], each(rows), jnp.inf)
+    return State(closed.q[0], closed.v[0]), State(later(closed.q), later(closed.v))

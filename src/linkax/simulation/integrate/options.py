@@ -1,0 +1,134 @@
+"""Options of a run, most of them diffrax's own objects, checked before anything is compiled."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.model.numbers import positive, real, require, require_type, whole_number
+from linkax.simulation.integrate.accuracy import Accuracy
+from linkax.simulation.integrate.step_control import MechanismControl
+from linkax.xla.tracing import concrete
+
+# What each option is, and what to give.
+KINDS = {
+    "saveat": (diffrax.SaveAt, "diffrax.SaveAt(ts=...)"),
+    "solver": (diffrax.AbstractSolver, "diffrax.Dopri8()"),
+    "stepsize_controller": (diffrax.AbstractStepSizeController, "diffrax.PIDController(rtol=..., atol=...)"),
+    "adjoint": (diffrax.AbstractAdjoint, "diffrax.RecursiveCheckpointAdjoint()"),
+    "event": (diffrax.Event, "diffrax.Event(...)"),
+    "progress_meter": (diffrax.AbstractProgressMeter, "diffrax.TextProgressMeter()"),
+}
+FLOATS = ("float64", "float32")
+
+
+def check_kinds(**options):
+    """Whether options that are not None are of diffrax's kinds: objects, not classes or numbers."""
+    for name, entry in options.items():
+        kind, example = KINDS[name]
+        if entry is not None:
+            require_type(entry, kind, name, f"give one of diffrax, such as {example}")
+    if isinstance(options["adjoint"], diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint is BacksolveAdjoint, which leaves the loops; use diffrax.RecursiveCheckpointAdjoint()"
+        )
+
+
+def check_steps(solver, controller, dt0, max_steps, t0, t1):
+    """Whether a solver for ordinary differential equations can be stepped so; returns dt0 as an array, or None."""
+    if solver.term_structure is not diffrax.AbstractTerm:
+        kind = type(solver).__name__
+        raise ValueError(f"solver is {kind}, for equations of several terms; give another, such as diffrax.Dopri8()")
+    if max_steps is not None:
+        whole_number(max_steps, "max_steps")
+    inside = MechanismControl(controller)
+    if dt0 is None and isinstance(inside.innermost, diffrax.ConstantStepSize):
+        raise ValueError("stepsize_controller is ConstantStepSize, and dt0 is None; give the steps by dt0=... [s]")
+    if isinstance(inside.innermost, diffrax.StepTo):
+        if dt0 is not None:
+            raise ValueError(f"dt0 is {dt0!r}, and stepsize_controller is StepTo, which has the steps; leave out one")
+        _check_times(inside.innermost.ts, "stepsize_controller: ts [s]", t0, t1)
+    if inside.is_adaptive and not estimates_errors(solver):
+        raise ValueError(
+            f"solver is {type(solver).__name__}, which estimates no error for steps that adapt; use "
+            "stepsize_controller=diffrax.ConstantStepSize() and dt0=..., or another solver"
+        )
+    if dt0 is None:
+        return None
+    return positive(dt0, "dt0 [s]")
+
+
+def check_accuracy(accuracy):
+    """Whether this is one."""
+    presets = "give linkax.DRAFT, BALANCED, PRECISE or linkax.Accuracy(rtol=...)"
+    require_type(accuracy, Accuracy, "accuracy", presets)
+
+
+def estimates_errors(solver) -> bool:
+    """Whether steps can adapt to what it estimates."""
+    tableau = getattr(solver, "tableau", None)
+    return isinstance(solver, diffrax.AbstractAdaptiveSolver) and (tableau is None or bool(np.any(tableau.b_error)))
+
+
+def traced_tolerances(controller):
+    """Tolerances given as Python floats made arrays, so that another value compiles nothing anew."""
+    what = "stepsize_controller: a tolerance"
+
+    def traced(tolerance):
+        array = tolerance if isinstance(tolerance, jax.Array) else real(tolerance, what)
+        right = lambda x: ((x >= 0.0) & (x <= 1.0)).all()
+        return require(array, right, what, "it must be zero or more, and at most 1")
+
+    return with_tolerances(traced, controller)
+
+
+def check_saved_times(saveat, t0, t1, max_steps):
+    """Whether the times to save are in order, from t0 to t1 [s], and steps that are saved have a largest number."""
+    if max_steps is None and (saveat.dense or any(sub.steps for sub in _subs(saveat))):
+        raise ValueError("max_steps is None, and saveat keeps all steps; give their largest number, such as 4096")
+    for ts in saved_times(saveat):
+        _check_times(ts, "saveat: ts [s]", t0, t1)
+
+
+def saves_times(saveat) -> bool:
+    """Whether states are saved at given times, and nothing else."""
+    return jax.tree.structure(saveat) == jax.tree.structure(diffrax.SaveAt(ts=np.zeros(1)))
+
+
+def saved_times(saveat) -> list:
+    """All arrays of times in a `SaveAt`."""
+    return [sub.ts for sub in _subs(saveat) if sub.ts is not None]
+
+
+def _subs(saveat):
+    is_sub = lambda node: isinstance(node, diffrax.SubSaveAt)
+    return [*filter(is_sub, jax.tree.leaves(saveat.subs, is_leaf=is_sub))]
+
+
+def _check_times(ts, what, t0, t1):
+    ts = real(ts, what)
+    if ts.ndim != 1:
+        raise ValueError(f"{what} has shape {ts.shape}; give a list of times")
+    if concrete(ts) is None:
+        return  # a run tells
+    first, last = (-np.inf if concrete(t0) is None else t0), (np.inf if concrete(t1) is None else t1)
+    right = lambda ts: np.all(np.isfinite(ts)) and np.all(np.diff(ts) >= 0.0) and first <= ts[0] and ts[-1] <= last
+    require(ts, right, what, f"give finite times in rising order, from t0 = {t0} s to t1 = {t1} s")
+
+
+def floating(dtype) -> np.dtype:
+    """The type of the numbers of a run."""
+    try:
+        is_array = isinstance(dtype, jax.Array | np.ndarray | np.generic)
+        found = "none" if is_array else jnp.dtype(float if dtype is None else dtype).name
+    except TypeError:
+        found = "none"
+    if found not in FLOATS:
+        raise ValueError(f"dtype is {dtype!r}; give jnp.float64 (default) or jnp.float32")
+    return jnp.dtype(found)
+
+
+def with_tolerances(change, tree):
+    """A pytree with all entries named rtol or atol changed."""
+    named = lambda path: path and getattr(path[-1], "name", None) in ("rtol", "atol")
+    return jax.tree_util.tree_map_with_path(lambda path, leaf: change(leaf) if named(path) else leaf, tree)

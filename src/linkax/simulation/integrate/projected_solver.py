@@ -1,0 +1,179 @@
+"""Any diffrax solver, with the state put back on the closed loops after each step."""
+
+import dataclasses
+from typing import ClassVar
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax import lax
+from jaxtyping import Array, Float
+
+from linkax.simulation.integrate.diffrax_contract import SolverState, StepError, stage_distances
+from linkax.simulation.integrate.problem import Problem
+from linkax.simulation.integrate.step_control import MechanismControl
+from linkax.simulation.integrate.switches import crossed, meet
+from linkax.xla.one_kernel import in_one_kernel
+
+DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
+STAGNATES = 0.9  # rate at which they no longer fall
+BEYOND = 1.5  # how far after its end a step may leave a passage, in steps
+
+
+def retry_factors(nodes) -> np.ndarray:
+    """By how much to change a step that meets an event at one of its nodes.
+
+    For each node of a Runge-Kutta tableau in (0, 1] the factor that brings the event as far from
+    all nodes as possible, into the middle of a gap between later ones or after the step's end.
+    """
+    nodes = np.asarray(nodes, dtype=float)
+    ends = np.unique([*nodes[nodes > 0.0], BEYOND])
+    middle, clearance = (ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2
+
+    def factor(node):
+        later = middle >= node
+        return node / middle[later][np.argmax((clearance / middle)[later])]
+
+    return np.array([factor(node) if node > 0.0 else 1.0 for node in nodes])
+
+
+class StageNorm(eqx.Module):
+    """The size of a change of the rates at a stage: what it changes of the state, relative to the tolerances."""
+
+    problem: Problem
+    y0: Float[Array, " n"]
+    duration: Float[Array, ""]
+    tolerances: tuple[Array, Array]
+
+    def __call__(self, change):
+        problem, (rtol, atol) = self.problem, self.tolerances
+        scales, (of_q, of_v) = problem.system.scales, problem.errors(self.y0, self.duration * change)
+        fastest = problem.system.fastest(problem.unpacked(self.y0)[1])
+        of_q, of_v = of_q / scales / (rtol + atol), of_v / scales / (rtol * fastest + atol)
+        return jnp.max(jnp.abs(jnp.concatenate([of_q, of_v])), initial=0.0)
+
+
+class Chord(diffrax.VeryChord):
+    """diffrax's root finder for implicit steps, which goes on for as long as it converges.
+
+    Up to version 0.7.2 diffrax's takes a step for failed where two iterations do not suffice.
+    """
+
+    def terminate(self, fn, y, args, options, state, tags):
+        """Whether what the iterations to come would still change is below kappa, or they diverge."""
+        rate, at_least_two = state.diffsize / state.diffsize_prev, state.step >= 2
+        contracts = at_least_two & (rate < 1.0)
+        to_come = state.diffsize * jnp.where(contracts, rate / jnp.where(contracts, 1.0 - rate, 1.0), 1.0)
+        failed = state.result != optx.RESULTS.successful
+        # Changes that stop falling within the tolerance are rounding, which fast waves make larger than kappa.
+        rounding = at_least_two & (rate >= STAGNATES) & (state.diffsize < 1.0)
+        converged = (to_come < self.kappa) | rounding
+        diverged = at_least_two & jnp.logical_not(rate <= DIVERGES) & jnp.logical_not(converged)
+        result = optx.RESULTS.where(diverged & jnp.logical_not(failed), optx.RESULTS.nonlinear_divergence, state.result)
+        return failed | converged | diverged, result
+
+
+class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
+    """Any diffrax solver, with the state put back on the closed loops after each step.
+
+    The estimate of the step's error is put there too: only its part in the tangent space remains
+    in the state. The rest is mostly rounding, which a singular configuration amplifies and the
+    correction removes; a step control that saw it would stall.
+
+    `is_final`: no transformation will differentiate its steps, so that each may be one kernel.
+
+    Not an `AbstractWrappedSolver`: diffrax would look through it for fields it does not have.
+    """
+
+    solver: diffrax.AbstractSolver
+    tolerances: tuple[Array, Array] | None
+    after_step: bool = eqx.field(static=True)
+    is_undifferentiated: bool = eqx.field(static=True)
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+
+    @staticmethod
+    def around(solver, accuracy, adjoint, control: MechanismControl) -> "ProjectedSolver":
+        """Wrap a solver.
+
+        What diffrax hands to a solver only where it sees it, it gets here: the kind of loop inside Runge-Kutta
+        steps that forward mode needs, and the tolerances for the root finder of an implicit one.
+        """
+        kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
+        if kind and getattr(solver, "scan_kind", kind) is None:
+            solver = eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda leaf: leaf is None)
+        finder = getattr(solver, "root_finder", None)
+        # What is no number stands for the tolerances of the step control.
+        lacks = finder is not None and not eqx.is_array_like(finder.rtol)
+        tolerances = control.tolerances((accuracy.rtol, accuracy.atol)) if lacks else None
+        return ProjectedSolver(solver, tolerances, accuracy.projection in ("both", "step"), control.is_undifferentiated)
+
+    def _stepping(self, problem, y0, duration):
+        """The solver for one step: its root finder measures what it finds as errors of the step are measured."""
+        if self.tolerances is None:
+            return self.solver
+        finder = self.solver.root_finder
+        if type(finder) is diffrax.VeryChord:
+            finder = Chord(0.0, 1.0, kappa=finder.kappa, linear_solver=finder.linear_solver)
+        norm = StageNorm(problem, y0, duration, self.tolerances)
+        return dataclasses.replace(self.solver, root_finder=dataclasses.replace(finder, rtol=0.0, atol=1.0, norm=norm))
+
+    @property
+    def interpolation_cls(self):
+        return self.solver.interpolation_cls
+
+    @property
+    def term_compatible_contr_kwargs(self):
+        return self.solver.term_compatible_contr_kwargs
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        one = jnp.ones((), args.system.dtype)
+        return SolverState(self.solver.init(terms, t0, t1, y0, args), one, one)
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+    @in_one_kernel(
+        when=lambda self, *_: self.is_undifferentiated,
+        sound=lambda self, terms, t0, t1, y0, *_: jnp.all(jnp.isfinite(y0)),
+    )
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """One step of the solver inside, and the correction after it: error and solver's state are linkax's own."""
+        # Solvers that begin with the last derivative of the step before must not where the state has moved since.
+        switching = len(args.sides(y0)) > 0
+        made_jump = True if switching or (self.after_step and args.method.moves_after_steps) else made_jump
+        solver = self._stepping(args, y0, t1 - t0)
+        y1, error, dense_info, inner, result = solver.step(terms, t0, t1, y0, args, solver_state.inner, made_jump)
+        stages = stage_distances(dense_info, t1 - t0, self.solver)
+        leaves = solver_state.arrives
+        if self.after_step:
+            y1, error, arrives = args.corrected(t1, y1, error)
+        else:
+            arrives = leaves if stages is None else stages[-1]
+            error = None if error is None else args.errors(y1, error)
+        if stages is None:
+            passes, retry = arrives, jnp.ones_like(arrives)
+        else:
+            nearest = jnp.argmin(stages[1:])
+            leaves, passes = stages[0], stages[1:][nearest]
+            retry = jnp.asarray(retry_factors(self.solver.tableau.c), passes.dtype)[nearest]
+        closest = jnp.minimum(solver_state.closest, jnp.minimum(passes, arrives))
+        switch = None
+        if switching:
+            within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
+            switch, sides = lax.stop_gradient(meet(*lax.stop_gradient((args, t0, t1, y0, y1)), within))
+            y1 = args.on_sides(y1, sides) if self.is_undifferentiated else crossed(args, t1, y1, sides)
+        state = SolverState(inner, arrives, closest)
+        return y1, StepError(error, leaves, passes, retry, switch), dense_info, state, result
+
+    def corrected(self, problem: Problem, t1, y1, sides):
+        """The state that a step leaves, on these sides of switches."""
+        return crossed(problem, t1, problem.corrected(t1, y1)[0] if self.after_step else y1, sides)

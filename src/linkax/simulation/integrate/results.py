@@ -1,0 +1,121 @@
+"""How a simulation ended."""
+
+import diffrax
+import equinox as eqx
+
+from linkax.xla.enumerations import code
+
+
+class RESULTS(diffrax.RESULTS):
+    """`diffrax.RESULTS`, and what can go wrong with a mechanism."""
+
+    not_closed = (
+        "The loops of the initial state do not close. Make the state with `linkax.assemble`, which says which "
+        "joint is open, and how far."
+    )
+    not_assembled = (
+        "The loops cannot be closed with the positions and speeds that `linkax.assemble` was given. Outside of JAX "
+        "transformations it says which joint is open, and how far."
+    )
+    no_branch = (
+        "The initial configuration is singular, and the initial speeds lie on no branch of the motion. Make the state "
+        "with `linkax.assemble`, which finds speeds on a branch."
+    )
+    not_unique = (
+        "The mechanism starts at rest in a singular configuration, and the forces drive it along no single branch: "
+        "its motion is not unique. Give it speeds, or start a little along the branch it should take."
+    )
+    massless = (
+        "Bodies without mass, or without inertia, can move freely, so that no acceleration follows from the forces on "
+        "them. Give them mass and inertia, or a joint that holds them."
+    )
+    diverged = (
+        "A step of fixed size led to numbers that are not finite. Take smaller steps, or let the step size adapt."
+    )
+    times_out_of_order = (
+        "The times of the run make no sense: t1, saved times and dt0 must be finite, t1 after t0, and saved times in "
+        "rising order between them."
+    )
+    not_finite = (
+        "The initial state, the numbers of the mechanism, or its forces there are not finite, or a number is outside "
+        "of what it can be, such as a negative length; give finite ones. Outside of JAX transformations such a "
+        "mechanism is refused, by an error that names the number."
+    )
+
+
+KNOWN_RESULTS = (
+    "successful",
+    "max_steps_reached",
+    "dt_min_reached",
+    "diverged",
+    "event_occurred",
+    "not_assembled",
+    "not_closed",
+    "no_branch",
+    "not_unique",
+    "massless",
+    "not_finite",
+    "times_out_of_order",
+)
+
+
+ENDED_WELL = ("successful", "event_occurred")
+
+
+def result_name(result) -> str:
+    """The name of a result, such as "successful" or "max_steps_reached"."""
+    for name in KNOWN_RESULTS:
+        if bool(result == getattr(RESULTS, name)):
+            return name
+    return "failed"
+
+
+def remark_name(remark) -> str:
+    """The name of a remark, such as "none" or "stiff"."""
+    return next((name for name in WARNINGS if code(remark) == code(getattr(REMARKS, name))), "none")
+
+
+class REMARKS(eqx.Enumeration):
+    """What there is to say of a simulation that ended well: of the first that applies a single run warns."""
+
+    none = ""
+    rounding = (
+        "Rounding alone puts accelerations off by more than the tolerance: a body carries one far larger, or very "
+        "many. Ask for a larger rtol, or cut a joint so that another body carries it."
+    )
+    single_precision = (
+        "The motion passes a singular configuration, where branches of motion cross, and rounding of single precision "
+        "may move it to another; compare with double precision."
+    )
+    lingers = (
+        "The motion does not leave a singular configuration, where branches of motion cross: rounding may move it from "
+        "one to another."
+    )
+    stiff = (
+        "A stiff spring, damper or beam, and not the motion, chooses the steps. Take a rigid joint or constraint in "
+        "its place, or, with an explicit solver, solver=diffrax.Kvaerno5()."
+    )
+
+
+class AccuracyWarning(UserWarning):
+    """A simulation that rounding keeps from the tolerance asked for; `Solution.error_estimate` tells how far."""
+
+
+class StiffnessWarning(UserWarning):
+    """A simulation whose steps one fast element chooses, and not the motion."""
+
+
+WARNINGS = {
+    "rounding": AccuracyWarning,
+    "single_precision": AccuracyWarning,
+    "lingers": AccuracyWarning,
+    "stiff": StiffnessWarning,
+}
+
+
+class SimulationError(RuntimeError):
+    """A simulation that did not reach its end; `solution` holds the part computed."""
+
+    def __init__(self, message, solution=None):  # the message alone is what pickle gives, the rest follows
+        super().__init__(message)
+        self.solution = solution

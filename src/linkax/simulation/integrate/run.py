@@ -1,0 +1,208 @@
+"""A run: what is to be integrated, how, and what is saved of it, checked once and carried whole."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from linkax.formulations.formulation import AbstractFormulation
+from linkax.formulations.named import formulation as named_formulation
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.functions import Function
+from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import require_bool, require_type
+from linkax.simulation.integrate.accuracy import Accuracy
+from linkax.simulation.integrate.default_solver import default_solver
+from linkax.simulation.integrate.discrete_adjoint import has_discrete_adjoint
+from linkax.simulation.integrate.options import (
+    check_accuracy,
+    check_kinds,
+    check_saved_times,
+    check_steps,
+    floating,
+    saves_times,
+    traced_tolerances,
+)
+from linkax.simulation.integrate.step_control import MechanismControl
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import checked_state, checked_time
+from linkax.xla.tracing import all_concrete, concrete
+
+DEFAULT_FORMULATION = TangentSpace()
+DEFAULT_MAX_STEPS = 16**4
+DEFAULT_SAVES = 201
+SAVE_STATE = diffrax.SubSaveAt(t1=True).fn
+
+
+class DiffraxOptions(NamedTuple):
+    """diffrax's own objects: how to step, what to save, how to differentiate."""
+
+    dt0: Any
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    max_steps: int | None
+    saveat: diffrax.SaveAt | None = None
+    adjoint: diffrax.AbstractAdjoint | None = None
+    event: diffrax.Event | None = None
+    progress_meter: diffrax.AbstractProgressMeter | None = None
+
+
+class Run(eqx.Module):
+    """One run of a mechanism from a state at t0 to t1 [s], as `linkax.simulate` was asked for it.
+
+    - `formulation`: of the equations of motion. `accuracy`: tolerances and projection.
+    - `optimise`: see `linkax.simulate`.
+    - `options`: diffrax's objects, held as arrays and the rest, so that a solution may hold a run.
+    """
+
+    mechanism: Mechanism
+    state: State
+    t0: Float[Array, "*batch"]
+    t1: Float[Array, "*batch"]
+    formulation: AbstractFormulation
+    accuracy: Accuracy
+    optimise: bool = eqx.field(static=True)
+    _arrays: DiffraxOptions
+    _rest: DiffraxOptions = eqx.field(static=True)
+
+    def __init__(self, mechanism, state, t0, t1, formulation, accuracy, optimise, options: DiffraxOptions):
+        self.mechanism, self.state, self.t0, self.t1 = mechanism, state, t0, t1
+        self.formulation, self.accuracy, self.optimise = formulation, accuracy, optimise
+        self._arrays, self._rest = eqx.partition(options, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
+
+    @staticmethod
+    def of(mechanism, state, *, t0, t1, accuracy, formulation, dtype, optimise, **given) -> "Run":
+        """Check all options of `linkax.simulate`, and fill in those that are None.
+
+        **Raises:** `ValueError` for the first one that is wrong.
+        """
+        dtype, t0, t1 = floating(dtype), checked_time(t0, "t0"), checked_time(t1, "t1")
+        if concrete(t0) is not None and concrete(t1) is not None and not t1 > t0:
+            raise ValueError(f"t1 is {t1} s, t0 is {t0} s; t1 must be larger")
+        state = checked_state(mechanism, state)
+        check_accuracy(accuracy)
+        require_bool(optimise, "optimise")
+        check_kinds(**{name: entry for name, entry in given.items() if name not in ("dt0", "max_steps")})
+        formulation = checked_formulation(formulation, accuracy)
+        options = _filled_in(mechanism, accuracy, t0, t1, **given)
+        mechanism, state, t0, accuracy = cast((mechanism, state, t0, accuracy), dtype)
+        return Run(mechanism, state, t0, t1, formulation, accuracy, optimise, options)
+
+    @staticmethod
+    def of_state(mechanism, state, t, formulation, accuracy) -> "Run":
+        """What a state alone says of a run: nothing is stepped."""
+        return Run(mechanism, state, t, t, formulation, accuracy, True, DiffraxOptions(None, None, None, None))
+
+    @property
+    def is_integrated(self) -> bool:
+        """False for what a state alone says of a run."""
+        return self.options.solver is not None
+
+    @property
+    def options(self) -> DiffraxOptions:
+        """diffrax's objects."""
+        return eqx.combine(self._arrays, self._rest)
+
+    @property
+    def control(self) -> MechanismControl:
+        """The step control of a mechanism around diffrax's."""
+        return MechanismControl(self.options.controller, is_undifferentiated=self.has_discrete_adjoint)
+
+    @property
+    def has_discrete_adjoint(self) -> bool:
+        """Whether derivatives go over the accepted steps: the default where it can be."""
+        solver, saveat, event, max_steps = (getattr(self.options, name) for name in _DECIDE)
+        default = self.options.adjoint is None
+        return default and saves_states(saveat) and has_discrete_adjoint(solver, saveat, event, max_steps)
+
+    @property
+    def adjoint(self) -> diffrax.AbstractAdjoint:
+        """How diffrax itself differentiates."""
+        if self.options.adjoint is not None:
+            return self.options.adjoint
+        return diffrax.ForwardMode() if self.has_discrete_adjoint else diffrax.RecursiveCheckpointAdjoint()
+
+    @property
+    def quick(self) -> bool:
+        """Whether to compile a program for one run: large arrays, as of beams, take as long to compile either way."""
+        return not self.optimise and not self.mechanism.beams
+
+    @property
+    def tangent_space(self) -> TangentSpace:
+        """What measures ranks and distances from singular configurations: the formulation, or the paper's."""
+        return self.formulation if isinstance(self.formulation, TangentSpace) else DEFAULT_FORMULATION
+
+    def changed(self, **changes) -> "Run":
+        """The same run with other fields, or other objects of diffrax."""
+        options = {name: changes.pop(name) for name in DiffraxOptions._fields if name in changes}
+        fields = {name: getattr(self, name) for name in _FIELDS} | changes
+        return Run(**fields, options=self.options._replace(**options))
+
+    def remembered(self) -> "Run":
+        """What a solution keeps: to run it again, or a part of it, without the functions of a user."""
+        saveat = self.options.saveat if saves_times(self.options.saveat) else None
+        return self.changed(saveat=saveat, adjoint=None, event=None, progress_meter=None)
+
+
+_DECIDE = ("solver", "saveat", "event", "max_steps")
+_FIELDS = ("mechanism", "state", "t0", "t1", "formulation", "accuracy", "optimise")
+
+
+def checked_formulation(formulation, accuracy: Accuracy = None) -> AbstractFormulation:
+    """A formulation from its name, or itself; None for the paper's."""
+    if isinstance(formulation, str):
+        formulation = named_formulation(formulation)
+    formulation = DEFAULT_FORMULATION if formulation is None else formulation
+    names = "give a name, linkax.TangentSpace() or a linkax.ClassicalFormulation"
+    require_type(formulation, AbstractFormulation, "formulation", names)
+    deprecated = None if accuracy is None else accuracy.tangent_space
+    return deprecated if deprecated is not None and isinstance(formulation, TangentSpace) else formulation
+
+
+def _filled_in(mechanism, accuracy, t0, t1, *, solver, stepsize_controller, dt0, max_steps, saveat, **others):
+    """`DiffraxOptions` with defaults in place of None."""
+    if stepsize_controller is None:
+        stepsize_controller = diffrax.PIDController(rtol=accuracy.rtol, atol=accuracy.atol)
+    if solver is None:
+        rtol, _ = MechanismControl(stepsize_controller).tolerances((None, None))
+        solver = default_solver(mechanism, rtol, t1 - t0)
+    dt0 = check_steps(solver, stepsize_controller, dt0, max_steps, t0, t1)
+    if saveat is None:
+        evenly = np.linspace if all_concrete((t0, t1)) else jnp.linspace
+        saveat = diffrax.SaveAt(ts=evenly(t0, t1, DEFAULT_SAVES))
+    check_saved_times(saveat, t0, t1, max_steps)
+    saveat, others["event"] = _with_functions(saveat, others["event"])
+    # Tolerances are arrays, so that another value compiles nothing anew.
+    return DiffraxOptions(dt0, solver, traced_tolerances(stepsize_controller), max_steps, saveat, **others)
+
+
+def saves_states(saveat) -> bool:
+    """Whether states are saved, and not functions of them."""
+    return isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is SAVE_STATE
+
+
+def cast(tree, dtype):
+    """A pytree with its numbers in a floating-point type."""
+    real = lambda leaf: isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype) if real(leaf) and leaf.dtype != dtype else leaf, tree)
+
+
+def _with_functions(saveat, event):
+    """The same with their functions compared by what they compute, see `linkax.model.code`."""
+    if event is not None:
+        functions = jax.tree.map(Function, event.cond_fn, is_leaf=callable)
+        event = eqx.tree_at(lambda e: e.cond_fn, event, functions)
+    if not saves_states(saveat):
+        is_sub = lambda node: isinstance(node, diffrax.SubSaveAt)
+        saveat = eqx.tree_at(lambda s: s.subs, saveat, jax.tree.map(_with_function, saveat.subs, is_leaf=is_sub))
+    return saveat, event
+
+
+def _with_function(sub):
+    if sub.fn is SAVE_STATE or (function := Function(sub.fn)).numbers:  # which diffrax takes for structure
+        return sub
+    return eqx.tree_at(lambda s: s.fn, sub, function)

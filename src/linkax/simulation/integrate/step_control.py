@@ -1,0 +1,139 @@
+"""Any diffrax step size controller, for motion on a manifold with singular configurations and switches."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from linkax.xla.derivatives import ratio
+from linkax.xla.one_kernel import in_one_kernel
+
+NOISE_ULPS = 1.0
+SEEN_ULPS = 512.0  # of estimates: rounding changes larger ones by less than a hundredth
+SEEN = 1e-3  # of the tolerance, which is as small
+FIRST_STEP = 1e-3  # of the whole time
+FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
+FIRST_TURN_SINGULAR = 1e-3  # from a singular configuration, where the first stage does not know all of the loops
+SMALLEST_STEP_ULPS = 4.0
+MOST_RETRIES = 4
+FEASIBLE = 0.1  # of a step's first distance: what any step can keep from a passage
+
+
+class MechanismControl(diffrax.AbstractStepSizeController):
+    """Any diffrax step size controller, measuring errors in the units of the mechanism.
+
+    The controller inside sees coordinates in radians and lengths of the mechanism, all of
+    magnitude one, and speeds in the same units, all of the magnitude of the largest: a joint
+    that has made many turns, or that stands still for a moment, does not change the tolerance.
+    The error it sees has rounding taken off, which no smaller step would lower, and which grows
+    near a singular configuration.
+
+    An adaptive step that has a stage close to a singular configuration is tried again, shorter,
+    so that the configuration falls between two stages. Where a few tries do not help, or the step
+    begins in the singular configuration, it is left as it is. One that goes past a switch of a force element is tried
+    again up to there, see `linkax.simulation.integrate.switches`.
+
+    `is_final`: see `Projected`.
+    """
+
+    controller: diffrax.AbstractStepSizeController
+    is_undifferentiated: bool = eqx.field(static=True, default=False)
+
+    def wrap(self, direction):
+        return MechanismControl(self.controller.wrap(direction), self.is_undifferentiated)
+
+    @property
+    def is_adaptive(self) -> bool:
+        """Whether the controller inside chooses the steps by their errors."""
+        return isinstance(self.innermost, diffrax.AbstractAdaptiveStepSizeController)
+
+    def tolerances(self, otherwise):
+        """Relative and absolute tolerance of the controller inside; others where it has none."""
+        inner = self.innermost
+        return (inner.rtol, inner.atol) if self.is_adaptive else otherwise
+
+    @property
+    def innermost(self) -> diffrax.AbstractStepSizeController:
+        """The controller inside others that hold one."""
+        inner = self.controller
+        while hasattr(inner, "controller"):
+            inner = inner.controller
+        return inner
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        _, v = args.unpacked(y0)
+        if dt0 is None and self.is_adaptive:
+            # Not diffrax's choice, which would compile the equations of motion twice more.
+            most = jnp.where(args.from_singular, FIRST_TURN_SINGULAR, FIRST_TURN)
+            turning = ratio(most, args.system.fastest(v), jnp.inf)
+            dt0 = jnp.minimum(FIRST_STEP * (t1 - t0), turning)
+            dt0 = lax.stop_gradient(dt0)
+        first, state = self.controller.init(terms, t0, t1, (v, v), dt0, args, func, error_order)
+        return first, (state, jnp.zeros((), int))
+
+    @in_one_kernel(when=lambda self, *_: self.is_undifferentiated, sound=lambda self, t0, *_: jnp.isfinite(t0))
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """Keep the step or not, and choose the next one; `y_error` is a `StepError`."""
+        scales = args.system.scales
+        magnitudes = tuple(_magnitudes(args, y) for y in (y0, y1_candidate))
+        scaled = None
+        if y_error.error is not None and self.is_adaptive:
+            noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.distance_floor)
+            # The second is none where the step has led to no numbers.
+            largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), *magnitudes)
+            # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
+            least = jnp.minimum(SEEN_ULPS * jnp.finfo(scales.dtype).eps, SEEN * self.innermost.rtol)
+            scaled = tuple(
+                jnp.maximum(jnp.abs(_less(e / scales, noise * scale)), least * scale)
+                for e, scale in zip(y_error.error, largest, strict=True)
+            )
+        before, retries = controller_state
+        keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
+            t0, t1, *magnitudes, args, scaled, error_order, before
+        )
+        # A step size that is not a number does not proceed either.
+        proceeds = next_t1 - next_t0 > SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t1), 1e-3)
+        keep = keep & args.can_start
+        result = diffrax.RESULTS.where(keep | (proceeds & args.can_start), result, diffrax.RESULTS.dt_min_reached)
+        if not self.is_adaptive:
+            finite = jnp.all(jnp.isfinite(y1_candidate))
+            result = diffrax.RESULTS.where(finite, result, diffrax.RESULTS.dt_min_reached)
+            return keep & finite, jnp.where(finite, next_t0, t0), next_t1, jump, (after, retries), result
+        near = jnp.minimum(args.accuracy.clearance, FEASIBLE * y_error.leaves)
+        again = keep & (y_error.passes < near) & (retries < MOST_RETRIES)
+        end = t0 + y_error.retry * (t1 - t0)
+        if y_error.switch is not None:
+            late = y_error.switch < 1.0
+            to_switch = t0 + y_error.switch * (t1 - t0)
+            end = jnp.where(late, jnp.where(keep, to_switch, jnp.minimum(to_switch, next_t1)), end)
+            again = again | late
+        either = lambda retry, otherwise: jax.tree.map(lambda a, b: jnp.where(again, a, b), retry, otherwise)
+        return (
+            keep & jnp.logical_not(again),
+            either(t0, next_t0),
+            either(end, next_t1),
+            jump & jnp.logical_not(again),
+            (either(before, after), jnp.where(again, retries + 1, jnp.where(keep, 0, retries))),
+            result,
+        )
+
+
+def _magnitudes(problem, y):
+    """What the tolerances are relative to: one for coordinates, the largest speed for speeds."""
+    q, v = problem.unpacked(y)
+    fastest = jnp.broadcast_to(problem.system.fastest(v), v.shape)
+    return jnp.where(jnp.all(jnp.isfinite(q)), jnp.ones_like(v), jnp.nan), fastest
+
+
+def _noise(distance, nearest):
+    """Rounding along the motion, relative: it grows like 1/d, up to 1/`nearest`.
+
+    Across the motion it grows like 1/d², but that the correction takes off.
+    """
+    return NOISE_ULPS * jnp.finfo(distance.dtype).eps / jnp.maximum(distance, nearest)
+
+
+def _less(error, noise):
+    """An error less the noise in it."""
+    return jnp.where(jnp.abs(error) > noise, error - jnp.sign(error) * noise, 0.0 * error)

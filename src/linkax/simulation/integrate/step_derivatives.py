@@ -1,0 +1,221 @@
+"""Derivatives of a run by its accepted steps, once forwards for tangents, once backwards for cotangents.
+
+What diffrax integrates with steps chosen as it goes, is here differentiated as it was computed, with those steps given.
+Each equation of motion compiles once for its tangent and once for its cotangent, where differentiating the loop over
+steps itself needs seven copies.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from linkax.simulation.integrate.problem import Problem
+from linkax.simulation.integrate.projected_solver import ProjectedSolver
+from linkax.xla.derivatives import materialise
+from linkax.xla.one_kernel import where_finite
+from linkax.xla.products_as_sums import with_products_as_sums
+
+
+class InitialValueProblem(NamedTuple):
+    """What a motion depends on: a problem, the state y0 at t0, the last time t1, and the saved times."""
+
+    problem: Problem
+    y0: Float[Array, " n"]
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+    saved: Float[Array, " k"] | None
+
+
+class Steps(NamedTuple):
+    """The accepted steps of an integration: their ends, (s + 1, ...), the start first, and how many there are."""
+
+    ts: Float[Array, " s+1"]
+    ys: Float[Array, "s+1 n"]
+    count: Int[Array, ""]
+
+
+class Trajectory(NamedTuple):
+    """The states of a motion that have derivatives: at saved times, at the end, at all steps where asked for."""
+
+    saved: Float[Array, "k n"] | None
+    end: Float[Array, " n"]
+    steps: Float[Array, "s+1 n"] | None = None
+
+
+class Tableau(NamedTuple):
+    """The coefficients of an explicit Runge-Kutta method: a, (s, s), b and c, (s,)."""
+
+    weights: np.ndarray
+    result: np.ndarray
+    nodes: np.ndarray
+
+    @staticmethod
+    def of(solver) -> "Tableau":
+        tableau = solver.tableau
+        weights = np.zeros((tableau.num_stages, tableau.num_stages))
+        for row, entries in enumerate(tableau.a_lower):
+            weights[row + 1, : row + 1] = entries
+        return Tableau(weights, tableau.b_sol, np.concatenate([[0.0], tableau.c]))
+
+
+def _stages(solver, problem, t0, t1, y0):
+    """Increments kᵢ = Δt f(t0 + cᵢ Δt, y0 + Σ aᵢⱼ kⱼ) at the stages of a step, (s, n)."""
+    table, duration = Tableau.of(solver.solver), t1 - t0
+    weights, nodes = jnp.asarray(table.weights, y0.dtype), jnp.asarray(table.nodes, y0.dtype)
+
+    def stage(i, k):
+        return k.at[i].set(duration * problem.derivative(t0 + nodes[i] * duration, y0 + weights[i] @ k))
+
+    return lax.fori_loop(0, len(nodes), stage, jnp.zeros((len(nodes), len(y0)), y0.dtype))
+
+
+def _uncorrected(solver, problem, t0, t1, y0):
+    """One explicit Runge-Kutta step, y1 = y0 + Σ bᵢ kᵢ, as the dictionary that interpolates in it."""
+    k = _stages(solver, problem, t0, t1, y0)
+    return dict(y0=y0, y1=y0 + jnp.asarray(Tableau.of(solver.solver).result, y0.dtype) @ k, k=k)
+
+
+def _step(solver: ProjectedSolver, problem: Problem, t0, t1, y0, sides):
+    """One step and the correction after it: (y1 on the sides after the step, what interpolates in the step)."""
+    dense = _uncorrected(solver, problem, t0, t1, y0)
+    return solver.corrected(problem, t1, dense["y1"], sides), dense
+
+
+def _vjp(function, primals, cotangent):
+    """VJP of a function at primals; not a number where the cotangent is not."""
+    pull = lambda cotangent: jax.vjp(function, *primals)[1](cotangent)
+    undefined = jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), primals)
+    return where_finite(pull, cotangent, undefined)
+
+
+def _step_vjp(solver: ProjectedSolver, of_problem, problem, t0, t1, dense, sides, y1_bar, dense_bar):
+    """VJP of one step: cotangents of (y1, dense output) ↦ cotangents of (problem, t0, t1, y0).
+
+    `of_problem`: rebuilds the `Problem` from its differentiated leaves. `sides`: see `_step`.
+    """
+    table, duration = Tableau.of(solver.solver), t1 - t0
+    y0, k = dense["y0"], dense["k"]
+    weights, nodes = jnp.asarray(table.weights, y0.dtype), jnp.asarray(table.nodes, y0.dtype)
+    result = jnp.asarray(table.result, y0.dtype)
+    corrected = lambda problem, t, y: solver.corrected(of_problem(problem), t, y, sides)
+    rates = lambda problem, t, y: of_problem(problem).derivative(t, y)
+    problem_bar, t1_bar, y_bar = _vjp(corrected, (problem, t1, dense["y1"]), y1_bar)
+    y_bar = y_bar + dense_bar["y1"]
+    k_bar = dense_bar["k"] + result[:, None] * y_bar
+
+    def stage(back, carry):
+        problem_bar, t0_bar, t1_bar, y_bar, k_bar = carry
+        i = len(nodes) - 1 - back
+        at = problem, t0 + nodes[i] * duration, y0 + weights[i] @ k
+        more, t_bar, stage_bar = _vjp(rates, at, duration * k_bar[i])
+        stretch = k[i] @ k_bar[i] / duration
+        return (
+            jax.tree.map(jnp.add, problem_bar, more),
+            t0_bar + (1.0 - nodes[i]) * t_bar - stretch,
+            t1_bar + nodes[i] * t_bar + stretch,
+            y_bar + stage_bar,
+            k_bar + weights[i][:, None] * stage_bar,
+        )
+
+    begin = problem_bar, jnp.zeros_like(t0), t1_bar, y_bar + dense_bar["y0"], k_bar
+    return lax.fori_loop(0, len(nodes), stage, begin)[:-1]
+
+
+def _within(solver: ProjectedSolver, t0, t1, dense, t):
+    """Interpolate the motion at a time within a step."""
+    return solver.interpolation_cls(t0=t0, t1=t1, **dense).evaluate(t)
+
+
+def tangents_over_steps(solver, every, ivp, steps, tangents: InitialValueProblem) -> Trajectory:
+    """JVP of a run, step by step from the first: tangents of its states; None among `tangents` is zero."""
+    saved, y0, last = ivp.saved, ivp.y0, steps.count - 1
+    saved_dot = None if saved is None else materialise(saved, tangents.saved)
+
+    def step(sides, problem, t0, t1, y):
+        return _step(solver, problem, t0, t1, y, sides)
+
+    def one(carry):
+        k, j, y, motion = carry
+        ends = steps.ts[k], steps.ts[k + 1]
+        begin_dot = jnp.where(k == 0, materialise(ivp.t0, tangents.t0), 0.0)
+        end_dot = jnp.where(k == last, materialise(ivp.t1, tangents.t1), 0.0)
+        moved = tangents.problem, begin_dot, end_dot, motion.end
+        sides = ivp.problem.sides(steps.ys[k + 1])
+        (y, dense), (y_dot, dense_dot) = eqx.filter_jvp(functools.partial(step, sides), (ivp.problem, *ends, y), moved)
+
+        def save(carry):
+            j, found = carry
+            within = functools.partial(_within, solver)
+            _, value = jax.jvp(within, (*ends, dense, saved[j]), (begin_dot, end_dot, dense_dot, saved_dot[j]))
+            return j + 1, found.at[j].set(value)
+
+        found = motion.saved
+        if saved is not None:
+            j, found = lax.while_loop(lambda carry: _reached(saved, carry[0], ends[1]), save, (j, found))
+        return k + 1, j, y, Trajectory(found, y_dot, motion.steps.at[k + 1].set(y_dot) if every else None)
+
+    motion = Trajectory(
+        saved=None if saved is None else jnp.zeros((len(saved), len(y0)), y0.dtype),
+        end=materialise(y0, tangents.y0),
+        steps=jnp.zeros_like(steps.ys).at[0].set(materialise(y0, tangents.y0)) if every else None,
+    )
+    begin = jnp.zeros((), int), jnp.zeros((), int), y0, motion
+    return lax.while_loop(lambda carry: carry[0] < steps.count, with_products_as_sums(one), begin)[-1]
+
+
+def _reached(saved, j, t):
+    """Whether there is a j-th saved time, up to t."""
+    return (j < len(saved)) & (saved[jnp.minimum(j, len(saved) - 1)] <= t)
+
+
+def cotangents_over_steps(solver, ivp, steps, wanted, cotangent: Trajectory) -> InitialValueProblem:
+    """VJP of a run, step by step from the last: cotangents of the leaves of `ivp` that are `wanted`."""
+    problem, fixed = eqx.partition(ivp.problem, wanted.problem)
+    saved, last = ivp.saved, steps.count - 1
+
+    of_problem = lambda problem: eqx.combine(problem, fixed)
+
+    def one(carry):
+        k, j, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = carry
+        ends = steps.ts[k], steps.ts[k + 1]
+        dense = _uncorrected(solver, ivp.problem, *ends, steps.ys[k])
+        begin_bar = end_bar = jnp.zeros_like(ends[0])
+        dense_bar = jax.tree.map(jnp.zeros_like, dense)
+        if saved is not None:
+
+            def save(carry):
+                j, *bars, saved_bar = carry
+                within = functools.partial(_within, solver)
+                *more, t_bar = jax.vjp(within, *ends, dense, saved[j])[1](cotangent.saved[j])
+                bars = jax.tree.map(jnp.add, tuple(bars), tuple(more))
+                return j - 1, *bars, saved_bar.at[j].set(t_bar)
+
+            def inside(carry):
+                j = carry[0]
+                return (j >= 0) & ((saved[jnp.maximum(j, 0)] > ends[0]) | (k == 0))
+
+            begin = j, begin_bar, end_bar, dense_bar, saved_bar
+            j, begin_bar, end_bar, dense_bar, saved_bar = lax.while_loop(inside, save, begin)
+        sides = ivp.problem.sides(steps.ys[k + 1])
+        more, begin_more, end_more, y_bar = _step_vjp(
+            solver, of_problem, problem, *ends, dense, sides, y_bar, dense_bar
+        )
+        problem_bar = jax.tree.map(jnp.add, problem_bar, more)
+        t0_bar = jnp.where(k == 0, begin_bar + begin_more, t0_bar)
+        t1_bar = jnp.where(k == last, end_bar + end_more, t1_bar)
+        return k - 1, j, y_bar, problem_bar, t0_bar, t1_bar, saved_bar
+
+    zero = jnp.zeros((), steps.ts.dtype)
+    finish = steps.ts[steps.count]
+    count = 0 if saved is None else jnp.sum(saved <= finish)
+    saved_bar = None if saved is None else jnp.zeros_like(saved)
+    begin = last, count - 1, cotangent.end, jax.tree.map(jnp.zeros_like, problem), zero, zero, saved_bar
+    one = with_products_as_sums(one)
+    *_, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(lambda carry: carry[0] >= 0, one, begin)
+    return eqx.filter(InitialValueProblem(problem_bar, y_bar, t0_bar, t1_bar, saved_bar), wanted)

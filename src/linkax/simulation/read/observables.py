@@ -1,0 +1,206 @@
+"""What can be read from one instant of a motion; `linkax.Solution` reads it at all its times."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from linkax.equations.configuration import along_speeds, beam_point, configure
+from linkax.equations.coordinates import rates
+from linkax.equations.dynamics import applied_load, body_accelerations, kinetic_energy, potential_energy
+from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
+from linkax.equations.motion import move
+from linkax.equations.reactions import Reaction, reactions, reactions_to, seen_from
+from linkax.equations.system import System
+from linkax.formulations.formulation import AbstractFormulation, Dynamics
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
+from linkax.spatial.rotations import rotate
+from linkax.spatial.vectors import cross, largest
+
+UNCHANGED = 1e-6  # by a self-stress of magnitude one
+
+
+class Violation(NamedTuple):
+    """Largest violation of the loop rows, at each time or over the run.
+
+    - `position`: c, rotation rows [rad], translation rows in lengths of the loop.
+    - `velocity`: J v [1/s]. `acceleration`: J v̇ − γ [1/s²].
+    """
+
+    position: Float[Array, "..."]
+    velocity: Float[Array, "..."]
+    acceleration: Float[Array, "..."]
+
+
+class Pose(NamedTuple):
+    """Where a body's reference frame is: its origin [m], (..., 3), and its axes as columns, (..., 3, 3)."""
+
+    origin: Float[Array, "... 3"]
+    axes: Float[Array, "... 3 3"]
+
+
+class Power(NamedTuple):
+    """What raises kinetic plus potential energy [W].
+
+    - `forces`: of force elements, beyond the fall of their potential energy; damping counts as negative.
+    - `drives`: of constraints that change with time: drives, winches, cylinders.
+    """
+
+    forces: Float[Array, "..."]
+    drives: Float[Array, "..."]
+
+
+class Observables(NamedTuple):
+    """One saved time of a solution: found by `method`, split into normal and tangent space by `tangent_space`.
+
+    - `dynamics`: what `solve` finds, for the functions that need accelerations or multipliers.
+    """
+
+    system: System
+    method: AbstractFormulation
+    tangent_space: TangentSpace
+    t: Float[Array, ""]
+    q: Float[Array, " n_q"]
+    v: Float[Array, " n_v"]
+    dynamics: Dynamics | None = None
+
+    @property
+    def configuration(self):
+        return configure(self.system, self.t, self.q)
+
+    @property
+    def motion(self):
+        return move(self.configuration, self.v)
+
+    def solve(self) -> Dynamics:
+        return self.method.dynamics(self.system, self.t, self.q, self.v)
+
+    def position(self, body, point):
+        configuration = self.configuration
+        return configuration.world_position()[body] + _arm(configuration, body, point)
+
+    def velocity(self, body, point):
+        motion = self.motion
+        arm = _arm(motion.configuration, body, point)
+        return motion.velocity[body] + cross(motion.angular_velocity[body], arm)
+
+    def acceleration(self, body, point):
+        motion = self.motion
+        arm, omega = _arm(motion.configuration, body, point), motion.angular_velocity[body]
+        angular, linear = body_accelerations(motion, self.dynamics.acceleration)
+        return linear[body] + cross(angular[body], arm) + cross(omega, cross(omega, arm))
+
+    def center_of_mass(self, function, bodies):
+        """What `position`, `velocity` or `acceleration` say of the centre of mass of several bodies."""
+        of_bodies = function(self, bodies, jnp.zeros(3, self.q.dtype))
+        mass = self.system.mass[bodies]
+        return mass @ of_bodies / jnp.sum(mass)
+
+    def on_beam(self, function, beam, point):
+        """The same of a point fixed to the section of a beam at point[0]."""
+        place = lambda t, q: beam_point(configure(self.system, t, q), beam, point)
+        if function is Observables.position:
+            return place(self.t, self.q)
+        moving = lambda t, q, v: jax.jvp(place, (t, q), (jnp.ones_like(t), rates(self.system.topology, q, v)))[1]
+        if function is Observables.velocity:
+            return moving(self.t, self.q, self.v)
+        changes = jnp.ones_like(self.t), rates(self.system.topology, self.q, self.v), self.dynamics.acceleration
+        return jax.jvp(moving, (self.t, self.q, self.v), changes)[1]
+
+    def poses(self):
+        configuration = self.configuration
+        return Pose(configuration.world_position(), configuration.rotation[: self.system.topology.num_bodies])
+
+    def orientation(self, body):
+        return self.configuration.rotation[body]
+
+    def angular_velocity(self, body):
+        return self.motion.angular_velocity[body]
+
+    def joint(self, name):
+        return self.configuration.joint_coordinates(name)
+
+    def joint_speed(self, name):
+        return self.motion.joint_speeds(name)
+
+    def _least_multipliers(self):
+        multipliers = self.dynamics.multipliers
+        if not self.system.topology.num_rows:
+            return LeastMultipliers(multipliers, jnp.zeros((0, 0)))
+        tolerance = self.tangent_space.rank_tolerance
+        rows, scales = jacobian(self.configuration), self.system.scales
+        return least_multipliers(rows, multipliers, scales, tolerance, self.rank())
+
+    def _multipliers(self):
+        """Of minimum norm; of the paper's method, close to a singular configuration, as a limit along the motion."""
+        if isinstance(self.method, TangentSpace) and self.system.topology.num_rows:
+            return self.method.least_multipliers(self.system, self.t, self.q, self.v)
+        return self._least_multipliers().multipliers
+
+    def reactions(self, on, axes):
+        found = reactions(self.motion, self.dynamics.acceleration, self._multipliers())
+        return seen_from(self.configuration, found, on, axes)
+
+    def constraint_forces(self):
+        return sorted_multipliers(self.configuration, self._multipliers()).constraints
+
+    def _self_stresses(self):
+        """Multipliers with Jᵀλ = 0, a row each: those of rows that motion changes, and of rows that none does."""
+        topology = self.system.topology
+        immobile = topology.num_immobile_rows
+        free = self._least_multipliers().free.T
+        size = len(free) + immobile
+        stresses = jnp.zeros((size, size), self.q.dtype).at[: len(free), : len(free)].set(free)
+        stresses = stresses.at[len(free) :, len(free) :].set(jnp.eye(immobile))
+        return jnp.split(stresses, [len(free)], axis=1)
+
+    def unique(self, on, axes):
+        configuration = self.configuration
+
+        def changes(multipliers, immobile):
+            return seen_from(configuration, reactions_to(configuration, multipliers, immobile), on, axes)
+
+        force, moment = jax.vmap(changes)(*self._self_stresses())
+        # Multipliers are moments, forces times the length of their loop.
+        still = lambda change: jnp.max(jnp.abs(change), axis=0, initial=0.0) <= UNCHANGED
+        return Reaction(still(force * self.system.length), still(moment))
+
+    def unique_constraint_forces(self):
+        topology = self.system.topology
+        rows = self._self_stresses()[0][:, topology.num_rows - len(topology.constraints) :]
+        return jnp.max(jnp.abs(rows), axis=0, initial=0.0) <= UNCHANGED
+
+    def kinetic_energy(self):
+        return kinetic_energy(self.motion)
+
+    def potential_energy(self):
+        return potential_energy(self.configuration)
+
+    def power(self):
+        motion, configuration = self.motion, self.configuration
+        load = applied_load(motion)
+        force = load.joint_force + along_speeds(configuration, load.force, load.moment)
+        energy = lambda q: potential_energy(configure(self.system, self.t, q))
+        _, rise = jax.jvp(energy, (self.q,), (rates(self.system.topology, self.q, self.v),))
+        return Power(force @ self.v + rise, self.dynamics.multipliers @ rate(self.system, self.t))
+
+    def violation_and_scales(self):
+        """The violation, and the largest speed and acceleration of the joints [1/s, 1/s²]."""
+        configuration = self.configuration
+        position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
+        velocity = jacobian(configuration) @ self.v - rate(self.system, self.t)
+        violation = Violation(*map(largest, (position, velocity, self.dynamics.violation)))
+        speed = self.system.fastest(self.v)
+        return violation, speed, jnp.maximum(self.system.fastest(self.dynamics.acceleration), speed**2)
+
+    def rank(self):
+        return jnp.sum(self.tangent_space.constraint_split(self.system, self.t, self.q).inverse.rank)
+
+    def distance(self):
+        return self.tangent_space.distance(self.system, self.t, self.q)
+
+
+def _arm(configuration, body, point):
+    return rotate(configuration.rotation[body], point)

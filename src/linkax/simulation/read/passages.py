@@ -1,0 +1,292 @@
+"""Passages through singular configurations, found along a motion however coarsely it was saved."""
+
+import itertools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from diffrax import ThirdOrderHermitePolynomialInterpolation
+
+from linkax.equations.coordinates import on_manifold, rates, speeds
+from linkax.equations.system import system_of
+from linkax.formulations.classical import ClassicalFormulation
+from linkax.simulation.explain.error_estimate import has_parts, num_saves, part_of_run
+from linkax.simulation.integrate.results import ENDED_WELL, result_name
+from linkax.simulation.start.state import State
+from linkax.xla.tracing import quick_compile
+
+REFINEMENTS = 6
+POLISHES = 2
+ASIDE = 5e-3  # of the time since the state before: where the motion is looked at around a passage
+PRECISE = 3e-9  # of the whole time: what a polynomial between saved states may leave
+VANISHED = 0.1  # of the distances before and after: what a passage falls below
+TOGETHER = 1e-6  # of the whole time: passages that close are of several loops at once
+ALIKE = 1e-6  # relative: eigenvalues that pass through zero as one
+SINGULAR = 1e-4  # distance below which a state is on no side of a passage
+FASTEST = 10.0  # that distances change, per radian or length of the mechanism
+BATCH = 64  # intervals that one program looks at
+
+
+class Passages(NamedTuple):
+    """Times at which a motion goes through singular configurations [s], and what they cost.
+
+    - `times`: (n,), rising.
+    - `digits`: decimal digits of the state that the run lost to them: rounding errors of the
+      tangential motion grow like 1/d at the stages of steps, d the distance from a singular
+      configuration, and add up over the passages. Not a number for a classical formulation.
+    - `accuracy`: what the search may have missed `times` by [s], or not a number without passages. The motion itself is
+      off by as much as `Solution.error_estimate` tells.
+    """
+
+    times: np.ndarray
+    digits: float
+    accuracy: float
+
+
+class Samples(NamedTuple):
+    """States along a motion, and their distances from a singular configuration; times are the first axis."""
+
+    ts: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    distances: np.ndarray
+
+    @staticmethod
+    def of(solution) -> "Samples":
+        reached = np.isfinite(np.asarray(solution.ts))
+        parts = solution.ts, solution.q, solution.v, solution.singularity_distance()
+        return Samples(*(np.asarray(part)[reached] for part in parts))
+
+    def taken(self, which) -> "Samples":
+        return Samples(*(part[which] for part in self))
+
+    def then(self, other: "Samples") -> "Samples":
+        """Both, where the other begins with the last state of this one."""
+        return Samples(*(np.concatenate([part, more[1:]]) for part, more in zip(self, other, strict=True)))
+
+    def missed(self, system) -> np.ndarray:
+        """By how much time a cubic polynomial may miss the motion in each interval [s], (n - 1,).
+
+        The one over two intervals misses the state in their middle by sixteen times as much.
+        """
+        t, missed = self.ts, np.full(len(self.ts), np.inf)
+        places = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+        ends = (np.stack([part[:-2], part[2:]], axis=1) for part in (t, self.q, self.v))
+        middle = jax.vmap(lambda *interval: _on_cubic(system, *interval))(*ends, places)
+        off = np.asarray(
+            jax.vmap(lambda q, change: speeds(system.topology, q, change))(self.q[1:-1], middle - self.q[1:-1])
+        )
+        size = lambda values: np.max(np.abs(values / np.asarray(system.scales)), axis=1, initial=0.0)
+        missed[1:-1] = size(off) / 16.0 / np.maximum(size(self.v[1:-1]), np.finfo(float).tiny)
+        return np.where(np.isfinite(missed[1:]), np.maximum(missed[:-1], missed[1:]), np.inf)
+
+    def pairs(self, before) -> "Samples":
+        """States at both ends of intervals, (k, 2, ...)."""
+        return self.taken(np.stack([before, before + 1], axis=1))
+
+
+class _Found(NamedTuple):
+    """A passage: its time, the coordinates there, and what the search may have missed the time by."""
+
+    time: float
+    q: np.ndarray
+    accuracy: float
+
+
+def passages(solution) -> Passages:
+    """Passages of one `linkax.Solution`, not of a batch.
+
+    **Raises:** `ValueError` for a batch, or where the solution saved functions of its own.
+    """
+    found = _passages(solution)
+    times = np.array([passage.time for passage in found])
+    accuracy = max((passage.accuracy for passage in found), default=math.nan)
+    if isinstance(solution.formulation, ClassicalFormulation):  # which does not measure how close its stages come
+        return Passages(times, math.nan, accuracy)
+    lost = np.log10(max(len(times), 1) / max(float(solution.closest), np.finfo(float).eps))
+    return Passages(times, float(max(lost, 0.0)), accuracy)
+
+
+def singular_states(solution):
+    """Times at which a motion goes through singular configurations, (n,), and the coordinates there, (n, n_q)."""
+    found = _passages(solution)
+    states = np.array([passage.q for passage in found]).reshape(len(found), solution.q.shape[-1])
+    return np.array([passage.time for passage in found]), states
+
+
+def _passages(solution) -> list[_Found]:
+    """All passages, in order.
+
+    J at one state times the right inverse of J at the one before has eigenvalues near one; one that is negative has
+    passed through zero between. It is sought on a polynomial first, and then on the motion, run again from there.
+    """
+    if solution.ts.ndim != 1:
+        raise ValueError(f"passages of a batch of shape {solution.ts.shape[:-1]}; ask for one member at a time")
+    if solution.q is None:
+        raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
+    samples = _close_enough(solution)
+    samples = samples.taken(samples.distances > SINGULAR)
+    if len(samples.ts) < 2:
+        return []
+    intervals = _candidates(solution, samples)
+    pairs, missed = samples.pairs(intervals), samples.missed(system_of(solution.mechanism, solution.q.dtype))[intervals]
+    turned = [change.turned() for change in _between(solution, pairs, np.ones(len(pairs.ts)))[0]]
+    with_ends = np.repeat(np.arange(len(turned)), [len(ends) for ends in turned])
+    pairs, missed = pairs.taken(with_ends), missed[with_ends]
+    places, distances, states = _zeros(solution, pairs, np.concatenate([np.empty(0), *turned]))
+    vanished = np.flatnonzero(distances <= VANISHED * np.max(pairs.distances, axis=1))
+    times = pairs.ts[:, 0] + places * np.diff(pairs.ts, axis=1)[:, 0]
+    together = TOGETHER * np.ptp(samples.ts)
+    different = vanished[_apart(times[vanished], together)]
+    precise = PRECISE * np.ptp(samples.ts)
+    found = [
+        _Found(float(times[k]), states[k], float(missed[k]))
+        if missed[k] <= precise
+        else _polished(solution, pairs.taken(k), times[k], states[k])
+        for k in different
+    ]
+    return [found[k] for k in _apart(np.array([passage.time for passage in found]), together)]
+
+
+def _apart(times, together):
+    """The first of each times that lie together, in order."""
+    order = np.argsort(times)
+    return order[np.diff(times[order], prepend=-np.inf) > together]
+
+
+def _close_enough(solution) -> Samples:
+    """As many states as the run took steps: where fewer were saved, it is run again, part by part."""
+    samples, steps = Samples.of(solution), int(solution.stats.get("num_accepted_steps", 0))
+    if steps < len(samples.ts) or not has_parts(solution):
+        return samples
+    state, t0, found = solution.run.state, solution.run.t0, None
+    saves = num_saves(solution)
+    parts = -(-2 * steps // (saves - 1))
+    for begin, end in itertools.pairwise(np.linspace(float(t0), float(solution.t_end), parts + 1)):
+        part = solution.another(part_of_run(solution, state, np.linspace(begin, end, saves)))
+        if result_name(part.result) not in ENDED_WELL:
+            break
+        more, state = Samples.of(part), part.end
+        found = more if found is None else found.then(more)
+    return samples if found is None else found
+
+
+def _candidates(solution, samples):
+    """The intervals in which distances may have fallen to zero, as far as the joints move in them."""
+    scales = np.asarray(system_of(solution.mechanism, solution.q.dtype).scales)
+    fastest = np.max(np.abs(samples.v / scales), axis=1)
+    travelled = np.maximum(fastest[1:], fastest[:-1]) * np.diff(samples.ts)
+    smaller = np.minimum(samples.distances[1:], samples.distances[:-1])
+    return np.flatnonzero(smaller <= FASTEST * travelled)
+
+
+def _polished(solution, pair, time, q) -> _Found:
+    """A passage between two states, at the time and coordinates that a polynomial says, as the motion has it."""
+    begin, accuracy = pair.ts[0], pair.ts[1] - pair.ts[0]
+    if not has_parts(solution):
+        return _Found(float(time), q, float(accuracy))
+    state = State(jnp.asarray(pair.q[0]), jnp.asarray(pair.v[0]))
+    for _ in range(POLISHES):
+        aside = ASIDE * (time - begin)
+        part = solution.another(part_of_run(solution, state, np.array([begin, time - aside, time + aside])))
+        if result_name(part.result) not in ENDED_WELL:
+            break
+        ts, qs, vs = (np.asarray(of)[:3] for of in (part.ts, part.q, part.v))
+        ends = [Samples(*(of[[0, k]][None] for of in (ts, qs, vs)), pair.distances[None]) for k in (1, 2)]
+        f, g = (_between(solution, end, np.ones(1))[0][0].smallest() for end in ends)
+        share = -f / (g - f) if g != f else 0.5
+        before, time, q = time, ts[1] + share * (ts[2] - ts[1]), qs[1] + share * (qs[2] - qs[1])
+        accuracy = abs(time - before)
+    return _Found(float(time), q, float(accuracy))
+
+
+class _Change(NamedTuple):
+    """J at a state times its right inverse G at one before, and J G there, which projects on the independent rows."""
+
+    change: np.ndarray
+    projector: np.ndarray
+
+    def eigenvalues(self):
+        """On the independent rows; ones where a motion that diverged has left no numbers."""
+        if not np.all(np.isfinite(self.change)):
+            return np.ones(len(self.change))
+        basis, _, _ = np.linalg.svd(self.projector)
+        basis = basis[:, : round(np.trace(self.projector))]
+        return np.linalg.eigvals(basis.T @ self.change @ basis)
+
+    def turned(self):
+        """The eigenvalues that have become negative; of those that are the same, of loops that move alike, one."""
+        off = np.abs(self.change - self.projector)
+        if np.max(np.sum(off, axis=0), initial=0.0) * np.max(np.sum(off, axis=1), initial=0.0) < 1.0:
+            return np.empty(0)  # as the norm of what the eigenvalues differ from one by is below one
+        values = self.eigenvalues()
+        turned = np.sort(values.real[values.real < -np.abs(values.imag)])
+        return turned[np.diff(turned, prepend=-np.inf) > ALIKE * np.abs(turned)]
+
+    def smallest(self):
+        """The eigenvalue next to zero."""
+        values = self.eigenvalues()
+        return values[np.argmin(np.abs(values))].real
+
+
+def _zeros(solution, pairs, ends):
+    """Where between two states the eigenvalues are zero that end at `ends`, d and the coordinates there."""
+    low, high = (np.zeros(len(ends)), np.ones(len(ends))), (np.ones(len(ends)), ends)
+    places, distances = low
+    states = np.zeros((len(ends), solution.q.shape[-1]))
+    for _ in range(REFINEMENTS if len(ends) else 0):
+        (a, f), (b, g) = low, high
+        places = a + (b - a) * f / (f - g)
+        changes, distances, states = _between(solution, pairs, places)
+        value = np.array([change.smallest() for change in changes])
+        low = np.where(value > 0.0, (places, value), low)
+        high = np.where(value > 0.0, high, (places, value))
+    return places, distances, states
+
+
+def _between(solution, pairs, places):
+    """Changes of J (see `_passages`), distances and coordinates, at places from 0 to 1 between two states."""
+    changes, distances, states = [], [np.zeros(0)], [np.zeros((0, solution.q.shape[-1]))]
+    for first in range(0, len(places), BATCH):
+        taken = np.arange(first, min(first + BATCH, len(places)))
+        filled = np.resize(taken, BATCH)  # one shape, so that one program serves
+        given = (*pairs.taken(filled)[:3], places[filled])
+        found = between_states(solution.mechanism, solution.run.tangent_space, solution.rank_nearby, *given)
+        change, projector, distance, q = (np.asarray(part)[: len(taken)] for part in found)
+        changes += map(_Change, change, projector)
+        distances, states = [*distances, distance], [*states, q]
+    return changes, np.concatenate(distances), np.concatenate(states)
+
+
+def _on_cubic(system, ts, qs, vs, place):
+    """Coordinates at a place from 0 to 1 between two states, by their cubic polynomial."""
+    duration, dtype = ts[1] - ts[0], qs.dtype
+    hermite = ThirdOrderHermitePolynomialInterpolation(
+        t0=jnp.zeros((), dtype),
+        t1=jnp.ones((), dtype),
+        y0=qs[0],
+        y1=qs[1],
+        k0=duration * rates(system.topology, qs[0], vs[0]),
+        k1=duration * rates(system.topology, qs[1], vs[1]),
+    )
+    return hermite.evaluate(place)
+
+
+@quick_compile
+def between_states(mechanism, tangent_space, rank_nearby, ts, qs, vs, places):
+    """J at places between two states, times its right inverse G at the first; J G there; d and q at the places.
+
+    All with a leading axis.
+    """
+    dtype = qs.dtype
+    system, method = system_of(mechanism, dtype), tangent_space.prepared(dtype, rank_nearby)
+
+    def at(ts, qs, vs, place):
+        q = on_manifold(system.topology, _on_cubic(system, ts, qs, vs, place))
+        here, _, distance = method.right_inverse(system, ts[0] + place * (ts[1] - ts[0]), q)
+        before, right_inverse, _ = method.right_inverse(system, ts[0], qs[0])
+        return here @ right_inverse, before @ right_inverse, distance, q
+
+    return jax.vmap(at)(ts, qs, vs, places)

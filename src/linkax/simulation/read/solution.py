@@ -1,0 +1,472 @@
+"""The motion that a simulation found, and what can be read from it."""
+
+import weakref
+from collections.abc import Callable
+from typing import Any, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from linkax.equations.reactions import Axes, Reaction, Side
+from linkax.equations.system import system_of
+from linkax.formulations.formulation import AbstractFormulation, Dynamics
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.beams import Beam
+from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import number, one_of, real, require
+from linkax.simulation.explain.error_estimate import refined_run
+from linkax.simulation.explain.remarks import remark
+from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
+from linkax.simulation.integrate.integrate import Outcome, integrate_run
+from linkax.simulation.integrate.map_saved_times import map_saved_times
+from linkax.simulation.integrate.options import check_accuracy
+from linkax.simulation.integrate.problem import Problem
+from linkax.simulation.integrate.results import REMARKS, RESULTS
+from linkax.simulation.integrate.run import Run, checked_formulation
+from linkax.simulation.read.observables import Observables, Pose, Power, Violation
+from linkax.simulation.read.passages import Passages, passages
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
+from linkax.xla.tracing import Program, all_concrete, concrete
+
+FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
+
+
+class Solution(eqx.Module):
+    """A motion at the times `ts` [s].
+
+    - `run`: what was integrated, and how; its `mechanism`, `formulation` and `accuracy` are the solution's own.
+    - `q`, `v`: coordinates and speeds of the tree's joints, (n_t, n_q) and (n_t, n_v), on the
+      closed loops with the paper's formulation. Times that were not reached hold infinity.
+    - `ys`: what a `SaveAt` with functions of its own saved; `q` and `v` are None then.
+    - `t_end`, `end`: the time reached and the `State` there.
+    - `stats`: as in diffrax: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `result`: a `linkax.RESULTS`; equal to `RESULTS.successful` where all went well.
+    - `rank_nearby`: rank along the motion, of each part that moves independently of the others, (k,);
+      in a singular configuration `rank` is smaller than their sum.
+    - `closest`: smallest distance from a singular configuration at any stage of any step; one where
+      the formulation does not measure it. Without derivative, which `singularity_distance` has.
+      `average`: the mean of that distance over the run.
+    - `definiteness`: of the mass matrix at the start, with whose inverse rounding of accelerations grows.
+
+    All that is read by the methods below comes as arrays with times as the first axis, in ground
+    axes and SI units. A solution from `jax.vmap` has the batch axes before that.
+    """
+
+    run: Run
+    ts: Float[Array, "*batch n_t"]
+    q: Float[Array, "*batch n_t n_q"] | None
+    v: Float[Array, "*batch n_t n_v"] | None
+    ys: Any
+    t_end: Float[Array, "*batch"]
+    end: State
+    stats: dict[str, Any]
+    result: RESULTS
+    rank_nearby: Int[Array, "*batch k"] | None
+    closest: Float[Array, "*batch"]
+    average: Float[Array, "*batch"]
+    definiteness: Float[Array, "*batch"]
+    interpolation: Any
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The mechanism that moved."""
+        return self.run.mechanism
+
+    @property
+    def accuracy(self) -> Accuracy:
+        """Tolerances and projection of the run."""
+        return self.run.accuracy
+
+    @property
+    def formulation(self) -> AbstractFormulation:
+        """The formulation of the equations of motion."""
+        return self.run.formulation
+
+    @staticmethod
+    def of_run(run: Run, outcome: Outcome) -> "Solution":
+        """What a run has left."""
+        initial, found, end, saved = outcome
+        return Solution(
+            run=run.remembered(),
+            ts=found.ts,
+            q=None if saved is None else saved.q,
+            v=None if saved is None else saved.v,
+            ys=found.ys if saved is None else None,
+            t_end=found.t_end,
+            end=end,
+            stats=found.stats,
+            result=found.result,
+            rank_nearby=initial.rank,
+            closest=found.closest,
+            average=found.average,
+            definiteness=initial.definiteness,
+            interpolation=found.interpolation,
+        )
+
+    def another(self, run: Run) -> "Solution":
+        """The solution of another run, such as a part of this one."""
+        return Solution.of_run(run, integrate_run(run))
+
+    @staticmethod
+    def of_state(
+        mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = BALANCED, formulation=None
+    ) -> "Solution":
+        """A solution of one time, to read reactions, energies or accelerations at a `State` on the closed loops."""
+        state = checked_state(mechanism, state)
+        check_accuracy(accuracy)
+        t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
+        result = RESULTS.successful
+        if not concrete(sound := sound_numbers(mechanism)):
+            result = RESULTS.where(sound, result, RESULTS.not_finite)
+        return Solution(
+            run=Run.of_state(mechanism, state, t, checked_formulation(formulation, accuracy), accuracy),
+            ts=t[None],
+            q=state.q[None],
+            v=state.v[None],
+            ys=None,
+            t_end=t,
+            end=state,
+            stats={},
+            result=result,
+            rank_nearby=None,
+            closest=jnp.ones((), state.q.dtype),
+            average=jnp.ones((), state.q.dtype),
+            definiteness=jnp.ones((), state.q.dtype),
+            interpolation=None,
+        )
+
+    def position(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+        """Position of a body's centre of mass, or of the point `at` on it [m].
+
+        `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m]. On a beam,
+        "base", "tip", a distance along the axis [m], or [x, y, z] off it.
+        """
+        return self._of_point(Observables.position, body, at)
+
+    def velocity(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+        """Velocity of a body's centre of mass, or of the point `at` on it [m/s]."""
+        return self._of_point(Observables.velocity, body, at)
+
+    def acceleration(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+        """Acceleration of a body's centre of mass, or of the point `at` on it [m/s²]."""
+        return self._of_point(Observables.acceleration, body, at)
+
+    def orientation(self, body: str) -> Float[Array, "*batch n_t 3 3"]:
+        """Axes of a body's reference frame, as columns."""
+        return _over_times(Observables.orientation, self, self._body(body))
+
+    def angular_velocity(self, body: str) -> Float[Array, "*batch n_t 3"]:
+        """Angular velocity of a body [rad/s]."""
+        return _over_times(Observables.angular_velocity, self, self._body(body))
+
+    def poses(self) -> dict[str, Pose]:
+        """Reference frames of all bodies by name, of a beam those of its sections: what an animation needs."""
+        origin, axes = _over_times(Observables.poses, self)
+        names = enumerate(self.mechanism.topology.bodies)
+        return {name: Pose(origin[..., index, :], axes[..., index, :, :]) for index, name in names}
+
+    def joint(self, name: str) -> Float[Array, "..."]:
+        """Coordinate of a joint, in the tree or cut [rad or m]; (n_t, n) where it has several."""
+        return self._joint(Observables.joint, name)
+
+    def joint_speed(self, name: str) -> Float[Array, "..."]:
+        """Speed of a joint, in the tree or cut [rad/s or m/s]."""
+        return self._joint(Observables.joint_speed, name)
+
+    def strain(self, beam: str) -> Float[Array, "*batch n_t n 6"]:
+        """Strains of a beam at its nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
+        found = self.mechanism.body(beam)
+        if not isinstance(found, Beam):
+            raise ValueError(f"body {beam!r} is no beam, and has no strain")
+        return found.strain(self.joint(beam))
+
+    def reaction(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
+        """What a joint or a constraint does.
+
+        **Arguments:**
+
+        - `name`: of a joint in the tree or cut, or of a constraint.
+        - `on`: "child" or "parent" of the joint. The moment is about the origin of its frame.
+        - `axes`: "ground", or "joint": h¹, h², h³ of the joint on that body.
+
+        **Returns:** a `Reaction` of forces [N] and moments [N m], (n_t, 3) each. For a drive, its
+        torque [N m] or force [N] along the joint, (n_t,); for a coupling, μ: it acts along each
+        joint with coefficient × μ.
+
+        With redundant constraints, reactions are not unique: these are of minimum norm, and
+        `reaction_unique` tells which components can be relied upon. Of a run through a singular configuration they
+        are limits along the motion there; not numbers where they have none, but grow without bound towards it.
+        """
+        if self._is_constraint(name):
+            return self._of_constraint(Observables.constraint_forces, name)
+        return self._of_joint(Observables.reactions, name, on, axes)
+
+    def reaction_unique(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
+        """Which components of `reaction` the mechanics determine, as booleans of the same shapes.
+
+        A component is unique where no self-stress of the redundant constraints changes it
+        (Wojtyra, Multibody System Dynamics 13, 2005). Rigid bodies determine no more: the rest
+        depends on elasticity, assembly, and here on the choice of the tree.
+        """
+        if self._is_constraint(name):
+            return self._of_constraint(Observables.unique_constraint_forces, name)
+        return self._of_joint(Observables.unique, name, on, axes)
+
+    def reactions(self) -> dict[str, Reaction]:
+        """The reactions of all joints on their children, in ground axes, by name."""
+        force, moment = _in_motion(Observables.reactions, self, "child", "ground")
+        names = enumerate(self.mechanism.topology.joints)
+        return {name: Reaction(force[..., index, :], moment[..., index, :]) for index, name in names}
+
+    def energy(self) -> Float[Array, "*batch n_t"]:
+        """Kinetic plus potential energy [J]."""
+        return self.kinetic_energy() + self.potential_energy()
+
+    def kinetic_energy(self) -> Float[Array, "*batch n_t"]:
+        """Kinetic energy [J]."""
+        return _over_times(Observables.kinetic_energy, self)
+
+    def potential_energy(self) -> Float[Array, "*batch n_t"]:
+        """Potential energy of the force elements that have one [J]."""
+        return _over_times(Observables.potential_energy, self)
+
+    def power(self) -> Power:
+        """The rate of `energy`, by what causes it [W], each (n_t,)."""
+        return _in_motion(Observables.power, self)
+
+    def violation(self) -> Violation:
+        """Largest violation of the loop rows at each time."""
+        return _in_motion(Observables.violation_and_scales, self)[0]
+
+    def worst_violation(self) -> Violation:
+        """Over all times, relative: to the run's largest speed and acceleration where those apply.
+
+        Positions count in radians and lengths of the loop, speeds and accelerations of the
+        joints in radians and lengths of the mechanism; the square of a speed counts as an
+        acceleration, since uniform motion of the joints accelerates the bodies.
+        """
+        violation, speed, acceleration = _in_motion(Observables.violation_and_scales, self)
+        largest = lambda values: jnp.max(jnp.where(jnp.isfinite(self.ts), values, 0.0), axis=-1)
+        relative = lambda values, scale: values / jnp.where(scale > 0.0, scale, 1.0)
+        return Violation(
+            largest(violation.position),
+            relative(largest(violation.velocity), largest(speed)),
+            relative(largest(violation.acceleration), largest(acceleration)),
+        )
+
+    def rank(self) -> Int[Array, "*batch n_t"]:
+        """Number of independent loop rows."""
+        return _over_times(Observables.rank, self)
+
+    def singularity_distance(self) -> Float[Array, "*batch n_t"]:
+        """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
+        return _over_times(Observables.distance, self)
+
+    def error_estimate(self, reading: "Callable[[Solution], Any] | None" = None, *, factor: float = 1e-2):
+        """How far this run is off, found by a second one that is more accurate.
+
+        The second run is in double precision, at tolerances `factor` times those of this one but not below 1e-13,
+        or at half its steps where those are fixed. It takes once to twice the time of this run. What both have in
+        common, such as a wrong mass or a reading that amplifies rounding, is not seen.
+
+        **Arguments:** `reading`: what of a solution to compare, such as `lambda solution: solution.position("hook")`;
+        default: `q`.
+
+        **Returns:** the absolute difference, as what `reading` returns; not a number where either run stopped before.
+
+        **Raises:** `ValueError` for a solution of one state, one that saved functions of its own, and steps
+        that cannot be refined.
+        """
+        if not self.run.is_integrated or self.q is None:
+            raise ValueError(
+                "error_estimate needs the solution of a run that saved states: from linkax.simulate, "
+                "without SaveAt(fn=...)"
+            )
+        between = lambda x: (x > 0.0) & (x < 1.0)
+        factor = require(number(factor, (), "factor"), between, "factor", "it must lie between 0 and 1")
+        return _difference(self, (lambda solution: solution.q) if reading is None else reading, factor)
+
+    def remark(self) -> REMARKS:
+        """What there is to say of a run that ended well, or of each of a batch: what a single run warns of.
+
+        Equal to `REMARKS.none` where there is nothing; `REMARKS[...]` has it in words. The run of a member by itself
+        names numbers and elements in its warning. Rates of elements, for `REMARKS.stiff`, are computed where a member
+        took many steps, and inside of JAX transformations always, which compiles longer: better return the `Solution`.
+        """
+        return remark(self)
+
+    def passages(self) -> Passages:
+        """Times at which the motion goes through singular configurations, and the digits lost.
+
+        Outside of JAX transformations, for one run.
+
+        **Raises:** `ValueError` for a batch, or where functions of one's own were saved.
+        """
+        return passages(self)
+
+    def evaluate(self, t) -> State:
+        """The state at a time [s] between the steps; needs `saveat=SaveAt(dense=True)`."""
+        if self.interpolation is None:
+            raise ValueError("evaluate needs a dense solution; simulate with saveat=diffrax.SaveAt(dense=True)")
+        t, first, last = number(t, (), "t [s]"), concrete(self.interpolation.t0), concrete(self.t_end)
+        if first is not None and last is not None and first.shape == ():
+            during = lambda t: (t >= first) & (t <= last)
+            t = require(t, during, "t [s]", f"give a time of the run, from {first} s to {last} s")
+        return _evaluate(self.mechanism, self.formulation, self.accuracy, self.rank_nearby, self.interpolation, t)
+
+    def _is_constraint(self, name):
+        return isinstance(name, str) and name in self.mechanism.topology.constraints
+
+    def _of_constraint(self, function, name):
+        """Of all constraints, so that all names share a program, that of one."""
+        return _in_motion(function, self)[..., self.mechanism.topology.constraints.index(name)]
+
+    def _of_joint(self, function, name, on, axes):
+        """Of reactions of all joints, so that all names share a program, those of one."""
+        for what, entry, choices in (("on", on, get_args(Side)), ("axes", axes, get_args(Axes))):
+            one_of(entry, choices, what)
+        self.mechanism.joint(name)
+        index = self.mechanism.topology.joints.index(name)
+        force, moment = _in_motion(function, self, on, axes)
+        return Reaction(force[..., index, :], moment[..., index, :])
+
+    def _body(self, name):
+        if isinstance(self.mechanism.body(name), Beam):
+            some = ", ".join(map(repr, self.mechanism.body(name).sections[:3]))
+            raise ValueError(f"{name!r} is a beam and bends; ask for one of its sections, {some}, ...")
+        return self._index(name)
+
+    def _index(self, section):
+        """Of a rigid body, for each member of a batch: a number that is traced, so that all names share a program."""
+        return np.full(self.ts.shape[:-1], self.mechanism.topology.bodies.index(section))
+
+    def _of_point(self, function, body, at):
+        """A function of an `Instant` for a point of a rigid body or of a beam."""
+        found = self.mechanism.body(body)
+        read = _in_motion if function is Observables.acceleration else _over_times
+        if isinstance(found, Beam) and at is None:
+            return read(
+                Observables.center_of_mass, self, function, np.stack([*map(self._index, found.sections)], axis=-1)
+            )
+        if at is None:
+            return read(function, self, self._index(body), found.center_of_mass)
+        if isinstance(at, str):
+            frame = found.at(at)
+            offset = jnp.broadcast_to(frame.offset, (*self.ts.shape[:-1], 3))
+            return read(function, self, self._index(frame.body), offset)
+        what = f"point on body {body!r} [m]"
+        offset = real(at, what)
+        if isinstance(found, Beam) and offset.shape == ():
+            offset = number(offset, (), what) * np.eye(3)[0]
+        offset = number(offset, (3,), what)
+        offset = found.within(offset, what) if isinstance(found, Beam) else offset
+        offset = jnp.broadcast_to(offset, (*self.ts.shape[:-1], 3))
+        if isinstance(found, Beam):
+            return read(Observables.on_beam, self, function, found, offset)
+        return read(function, self, self._index(body), offset)
+
+    def _joint(self, function, name):
+        self.mechanism.joint(name)
+        values = _over_times(function, self, name)
+        return values[..., 0] if values.shape[-1] == 1 else values
+
+
+def _difference(solution, reading, factor):
+    """Of a reading of a solution, or of all members of a batch, from that of a run at finer tolerances."""
+
+    def of_member(solution):
+        finer = solution.another(refined_run(solution, factor))
+        there = jnp.isfinite(solution.ts) & jnp.isfinite(finer.ts)
+
+        def apart(one, other):
+            across = there.reshape(-1, *(1,) * (one.ndim - 1))
+            return jnp.where(across, jnp.abs(one - other), jnp.nan)
+
+        return jax.tree.map(apart, reading(solution), reading(finer))
+
+    for _ in range(solution.ts.ndim - 1):
+        of_member = eqx.filter_vmap(of_member)
+    return of_member(solution)
+
+
+def _in_motion(function, solution, *details):
+    """`_over_times` of a function that needs accelerations or multipliers, for which all such share a program."""
+    return _over_times(function, solution, *details, dynamics=_over_times(Observables.solve, solution))
+
+
+def _over_times(function, solution, *details, dynamics=()):
+    """Evaluate a function of `Observables` at all times of all members of a batch."""
+    if solution.q is None:
+        raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
+    topology, run = solution.mechanism.topology, solution.run
+    few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
+    motion = SavedMotion(run.mechanism, run.formulation, run.tangent_space, solution.rank_nearby, *_states(solution))
+    given = function, motion, dynamics, details
+    read = lambda: _of_times.choose(few, *given)(*given)
+    named = all(isinstance(detail, str) for detail in details)
+    if not named or solution.ts.ndim > 1 or not all_concrete(solution):
+        return read()
+    return _kept(solution, (function, *details), read)
+
+
+class SavedMotion(NamedTuple):
+    """What is read: with another solver or tolerance the same program reads it."""
+
+    mechanism: Mechanism
+    formulation: AbstractFormulation
+    tangent_space: TangentSpace
+    rank_nearby: Int[Array, "*batch k"] | None
+    ts: Float[Array, "*batch n_t"]
+    q: Float[Array, "*batch n_t n_q"]
+    v: Float[Array, "*batch n_t n_v"]
+
+
+def _states(solution):
+    return solution.ts, solution.q, solution.v
+
+
+_of_solutions = {}  # what has been read from solutions that are alive, by their identity
+
+
+def _kept(solution, key, read):
+    """What `read` gives, once for a solution, while it lives: other names and readings ask for the same."""
+    if id(solution) not in _of_solutions:
+        _of_solutions[id(solution)] = {}
+        weakref.finalize(solution, _of_solutions.pop, id(solution))
+    kept = _of_solutions[id(solution)]
+    if key not in kept:
+        kept[key] = read()
+    return kept[key]
+
+
+@Program
+def _of_times(function, motion: SavedMotion, dynamics, details):
+    def of_member(motion, dynamics, details):
+        dtype = motion.q.dtype
+        system = system_of(motion.mechanism, dtype, fixed_scales=False)
+        tangent_space = motion.tangent_space.prepared(dtype, motion.rank_nearby)
+        method = motion.formulation.prepared(dtype, motion.rank_nearby)
+
+        def of_time(t, q, v, *dynamics):
+            found = Dynamics(*dynamics) if dynamics else None
+            return function(Observables(system, method, tangent_space, t, q, v, found), *details)
+
+        return map_saved_times(of_time, jnp.isfinite(motion.ts), motion.ts, motion.q, motion.v, *dynamics)
+
+    for _ in range(motion.ts.ndim - 1):
+        of_member = eqx.filter_vmap(of_member)
+    return of_member(motion, dynamics, details)
+
+
+@eqx.filter_jit
+def _evaluate(mechanism, formulation, accuracy, rank_nearby, interpolation, t):
+    dtype = interpolation.t0.dtype
+    t = jnp.asarray(t, dtype)
+    y = interpolation.evaluate(t)
+    return Problem(mechanism, system_of(mechanism, dtype), formulation.prepared(dtype, rank_nearby), accuracy).close(
+        t, y
+    )

@@ -1,0 +1,199 @@
+"""Consistent states from partial positions and speeds."""
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.equations.configuration import configure
+from linkax.equations.coordinates import neutral, on_manifold
+from linkax.equations.loops import Gap, gaps
+from linkax.equations.system import system_of
+from linkax.formulations.constraint_split import ConstraintSplit
+from linkax.model.mechanism import Mechanism
+from linkax.simulation.start.branch_speeds import other_speeds, speeds_on_branch
+from linkax.simulation.start.closing import CLOSED, LoopClosure, close_loops
+from linkax.simulation.start.initial_state import ON_BRANCH, moving_joints
+from linkax.simulation.start.nearest_solution import beams_of, rank_tolerance
+from linkax.simulation.start.state import State
+from linkax.simulation.start.validation import (
+    JointValues,
+    by_joint,
+    check_mechanism,
+    checked_time,
+    coordinates_by_joint,
+    sound_numbers,
+)
+from linkax.xla.tracing import all_concrete, quick_compile
+
+
+class AssemblyError(ValueError):
+    """The loops of a mechanism cannot be closed at the positions that were asked for."""
+
+
+class AssemblyWarning(UserWarning):
+    """The loops of a mechanism close only where beams are strained, or leave open on which branch it moves."""
+
+
+def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t=0.0) -> State:
+    """A state with closed loops, from coordinates and speeds of some of the joints.
+
+    **Arguments:**
+
+    - `positions`: {joint: coordinates [rad or m]}, of joints in the tree or cut; held. A number for
+      a joint with one coordinate, else all of them; see the joint types. For one of several the
+      key is (joint, index), counted like the joint's speeds.
+    - `speeds`: {joint: speeds [rad/s or m/s]}, likewise; held.
+    - `guess`: {joint: coordinates} of joints in the tree, where the search starts (default:
+      frames that coincide); chooses the assembly mode.
+    - `t`: time [s], which matters to drives.
+
+    Coordinates that are not held change as little as the loops allow from the guess, and
+    speeds that are not held are the smallest that the loops allow, both measured in radians
+    and in lengths of the mechanism. Where the search does not get from the guess to closed loops,
+    it starts again beside it, a little and then farther. Strains of beams stay as guessed, by default
+    zero; where no start leads to closed loops so, they change, with little energy. In a singular
+    configuration, where branches of the motion cross, speeds lie on that of the position where it is a little off
+    (1e-9), else on the branch nearest to these; give more of them to choose another.
+
+    Derivatives by numbers of the mechanism, positions and speeds given, and the guess, to any order: of
+    coordinates that are not held and that the loops leave free, those of the nearest to the guess, as if
+    it closed the loops.
+
+    **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
+    cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
+    `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
+    raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
+    Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain, and of speeds that
+    fit several branches.
+    """
+    check_mechanism(mechanism)
+    t = jnp.asarray(checked_time(t, "t"))
+    positions, guess = (
+        coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess"))
+    )
+    speeds = by_joint(mechanism, speeds, "speed", lambda joint: len(joint.speed_units))
+    for name, _ in guess.terms:
+        if name not in mechanism.topology.coordinates:
+            raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
+    state, remainder = _assemble(mechanism, positions, speeds, guess, t)
+    if not all_concrete((state, remainder)):
+        return State(state.q, jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf))
+    remainder = jax.tree.map(np.asarray, remainder)
+    _raise_if_open(mechanism, state, t, remainder)
+    for beam, (strain, energy) in remainder.strained.items():
+        if strain > remainder.most:
+            warnings.warn(
+                f"beam {beam!r} is strained, with an energy of {energy:.3g} J, as the loops do not close otherwise; "
+                "check lengths and offsets, hold fewer positions, or give another guess; linkax.equilibrium finds the "
+                "strains at rest",
+                AssemblyWarning,
+                stacklevel=2,
+            )
+    if remainder.undecided and (names := _open_speeds(mechanism, speeds, t, state)):
+        warnings.warn(
+            f"the configuration is singular, and the speeds asked fit several branches of the motion, which differ in "
+            f"the speeds of joints {names}; to choose a branch, ask for the speeds of some of these, too",
+            AssemblyWarning,
+            stacklevel=2,
+        )
+    return state
+
+
+def _open_speeds(mechanism, speeds, t, state):
+    """Names of joints that move otherwise on other branches with the speeds asked."""
+    others, are_some = other_speeds(mechanism, speeds, t, state.q, state.v)
+    differences = (others - state.v)[np.asarray(are_some)].T
+    names = moving_joints(system_of(mechanism, state.q.dtype), t, state.q, differences) if differences.size else ()
+    return ", ".join(map(repr, names))
+
+
+def _raise_if_open(mechanism, state, t, remainder):
+    topology = mechanism.topology
+    held = ", ".join(repr(along.joint) for along in remainder.positions.terms) or "none"
+    remains = lambda size, unit: f"a gap of {size:.6g} {unit} remains (positions held: {held})"
+    advice = "check lengths and offsets, hold fewer positions, or give another guess"
+    cuts = topology.joints[topology.num_bodies :]
+    for name, distance, angle in zip(cuts, remainder.gap.distance, remainder.gap.angle, strict=True):
+        for size, unit, most in ((distance, "m", CLOSED * remainder.length), (angle, "rad", CLOSED)):
+            if not size <= most:
+                raise AssemblyError(f"joint {name!r} does not close: {remains(size, unit)}; {advice}")
+    for constraint, size in zip(mechanism.constraints, remainder.gap.constraints, strict=True):
+        if not size <= remainder.most:
+            joints = f" of joint {', '.join(map(repr, constraint.joints))}" if constraint.joints else ""
+            raise AssemblyError(
+                f"{constraint.display_name}{joints} is not met at t = {float(t):.6g} s: "
+                f"{remains(size, 'rad or m')}; {advice}"
+            )
+    for what, misses in (("position", remainder.positions), ("speed", remainder.speeds)):
+        for along, miss in zip(misses.terms, misses.values, strict=True):
+            if not np.all(np.abs(miss) <= remainder.most):
+                size = np.max(np.abs(miss))
+                raise AssemblyError(
+                    f"the {what} asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not "
+                    f"allow it together with the other {what}s given, so ask for fewer"
+                )
+    tolerance = rank_tolerance(state.q.dtype)
+    if not remainder.off_branch <= ON_BRANCH * tolerance:
+        system = system_of(mechanism, state.q.dtype)
+        basis = ConstraintSplit.at(system, t, state.q, tolerance).inverse.basis
+        names = ", ".join(map(repr, moving_joints(system, t, state.q, basis)))
+        raise AssemblyError(
+            "the configuration is singular, and the speeds asked lie on no branch of the motion; its branches cross "
+            f"in the motion of joints {names}, so ask for the speeds of other joints among them, or of fewer"
+        )
+
+
+class _Remainder(eqx.Module):
+    """What is left open, for the error message; and of each beam the largest change of a strain, and its energy."""
+
+    gap: Gap
+    length: jax.Array
+    positions: JointValues
+    speeds: JointValues
+    off_branch: jax.Array
+    undecided: jax.Array
+    strained: dict
+
+    @property
+    def most(self):
+        """What coordinates and speeds may miss."""
+        return CLOSED * jnp.maximum(self.length, 1.0)
+
+    def is_met(self):
+        """Whether the loops are closed and all that is held is where it should be."""
+        missed = [*self.positions.values, *self.speeds.values, self.gap.constraints]
+        met = jnp.all(self.gap.distance <= CLOSED * self.length) & jnp.all(self.gap.angle <= CLOSED)
+        return met & jnp.array([jnp.all(jnp.abs(miss) <= self.most) for miss in missed]).all()
+
+
+@quick_compile
+def _assemble(mechanism, positions, speeds, guess, t):
+    system = system_of(mechanism, jnp.result_type(float))
+    topology = system.topology
+    q = neutral(topology, system.dtype)
+    for given in (guess, positions):
+        for along, entry in zip(given.terms, given.values, strict=True):
+            if along.joint in topology.coordinates:
+                q = q.at[topology.coordinate_slice(along)].set(entry)
+    demand = LoopClosure(system, t, positions)
+    begin = on_manifold(topology, q)
+    q = close_loops(demand, begin)
+    off = jnp.abs(demand.back(q, begin))
+    configuration = configure(system, t, q)
+    v, misses, off_branch, undecided = speeds_on_branch(configuration, speeds)
+    remainder = _Remainder(
+        gap=gaps(configuration),
+        length=system.length,
+        positions=JointValues(positions.terms, demand.misses(configuration)),
+        speeds=misses,
+        off_branch=off_branch,
+        undecided=undecided,
+        strained={
+            beam.beam: (jnp.max(off[topology.speeds[beam.beam]]), beam.energy(q[topology.coordinates[beam.beam]]))
+            for beam in beams_of(system)
+        },
+    )
+    return State(q, v), remainder

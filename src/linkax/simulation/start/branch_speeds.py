@@ -1,0 +1,148 @@
+"""Speeds that the loops allow, with some held; in a singular configuration on a branch of the motion."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from linkax.equations.configuration import configure
+from linkax.equations.loops import rate
+from linkax.equations.motion import move
+from linkax.equations.system import system_of
+from linkax.formulations.constraint_split import ConstraintSplit
+from linkax.linalg.constrained_solve import invert
+from linkax.simulation.start.closing import CLOSED
+from linkax.simulation.start.initial_state import ON_BRANCH
+from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
+from linkax.simulation.start.validation import JointValues
+from linkax.spatial.vectors import largest
+from linkax.xla.derivatives import materialise, pushforward, ratio
+from linkax.xla.tracing import quick_compile
+
+TURNS = 30  # of Newton's method: from close to where y² = x² is flat, each but halves the way
+BESIDE = 1e-2
+SEEN_ULPS = 100.0  # of rows that are not rounding alone
+STARTS = 12  # from which other branches are looked for
+SPREAD = 4.0  # of these, next to the speeds asked
+APART = 1e-3  # of the largest speed: what tells branches apart
+
+
+class _Asked(eqx.Module):
+    """Speeds that the loops and a user ask for, over `scale`: rows @ v is `right`, and v is on a branch."""
+
+    crossing: ConstraintSplit
+    rows: jax.Array
+    right: jax.Array
+    scale: jax.Array
+
+    def rest(self, v):
+        """What speeds leave over."""
+        return jnp.concatenate([self.right - self.rows @ v, -self.crossing.off_branch(v, self.scale)])
+
+    @property
+    def system(self):
+        return self.crossing.configuration.system
+
+    def slopes(self, v):
+        return -jax.jacfwd(self.rest)(v)
+
+    def next_to(self, v, tolerance=None):
+        """The nearest speeds that satisfy the rows, on a branch or not."""
+        return nearest_solution(self.system, v, self.rows, self.right, tolerance)
+
+    def missed(self, v):
+        """How far speeds are from those asked."""
+        return largest(self.right - self.rows @ v)
+
+    def aside(self, count):
+        """Other speeds that satisfy the rows, on a branch or not, (count, n_v)."""
+        anywhere = SPREAD * np.random.default_rng(0).normal(size=(count, len(self.system.scales)))
+        return jax.vmap(self.next_to)(jnp.asarray(anywhere, self.right.dtype) * self.system.scales)
+
+    def least(self):
+        """The smallest speeds, on a branch or not; close to a singular configuration on the branch of the position.
+
+        Also whether other branches may cross there, of which the position does not tell.
+        """
+        least, scales = self.next_to(jnp.zeros_like(self.system.scales)), self.system.scales
+        within = self.next_to(jnp.zeros_like(scales), SEEN_ULPS * jnp.finfo(scales.dtype).eps)
+        off = jax.vmap(self.off_branch)(jnp.stack([within, self.aside(1)[0]]))
+        told = (self.missed(within) <= CLOSED) & (off[0] <= BESIDE)
+        told_apart = told & (self.system.fastest(within - least) > APART * self.system.fastest(within))
+        moves = largest(self.right) > 0.0
+        return jnp.where(told, within, least), moves & (off[1] > BESIDE) & jnp.logical_not(told_apart)
+
+    def off_branch(self, v):
+        """How far speeds are from a branch, relative to themselves."""
+        fastest = self.system.fastest(v)
+        off = largest(self.crossing.off_branch(v, self.scale))
+        return ratio(off, fastest**2, 0.0)
+
+
+@eqx.filter_custom_jvp
+def _on_branch(asked, v):
+    """Speeds on a branch, by Newton steps from a little beside speeds v, which may lie just between two."""
+    beside = BESIDE * jnp.sum(asked.crossing.inverse.basis, axis=1)
+    off = asked.off_branch(v) > ON_BRANCH * rank_tolerance(v.dtype)
+    turn = lambda _, v: v + nearest_solution(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
+    # As many each time: with a loop that ends sooner XLA (jaxlib 0.10) finds no callbacks in the rest of the program.
+    return lax.fori_loop(0, TURNS, turn, v + jnp.where(off, beside, 0.0))
+
+
+@_on_branch.def_jvp
+def _on_branch_jvp(primals, changes):
+    """Where nothing is left over, to any order: the Newton steps have no derivative."""
+    (asked, begin), (change, begins) = primals, changes
+    v = _on_branch(asked, begin)
+    opens = pushforward(lambda asked: asked.rest(v), (asked,), (change,))[1]
+    return v, nearest_solution(asked.system, materialise(v, begins), asked.slopes(v), opens)
+
+
+def _asked(configuration, held):
+    system = configuration.system
+    crossing = ConstraintSplit.of(configuration, rank_tolerance(system.dtype))
+    right = jnp.concatenate([rate(system, configuration.t), *held.values])
+    size = largest(right)
+    scale = lax.stop_gradient(jnp.where(size > 0.0, size, 1.0))
+    still = jnp.zeros(system.topology.num_speeds, system.dtype)
+    rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(lambda v: held.speeds(move(configuration, v)))(still)])
+    return _Asked(crossing, rows, right / scale, scale)
+
+
+def speeds_on_branch(configuration, held):
+    """The smallest speeds with those of joints held, or near to them on a branch of the motion.
+
+    Speeds satisfy J v = b, and γ(v, v) is in the range of J; where the rank of J is constant, the
+    smallest do.
+
+    **Returns:** speeds, (n_v,); how far the smallest speeds that the loops allow are from those held, by
+    joint; how far the speeds are from such a branch, relative to themselves; and whether there may be others.
+    """
+    asked = _asked(configuration, held)
+    crossing, scale = asked.crossing, asked.scale
+    least, undecided = asked.least()
+    v = _on_branch(asked, least)
+    # What the loops leave of them: a row that is nearly none opens little, and yet may allow no motion at all.
+    opened = crossing.jacobian @ least - asked.right[: crossing.jacobian.shape[0]]
+    reached = held.speeds(move(configuration, scale * (least - crossing.inverse.normal @ opened)))
+    misses = JointValues(held.terms, tuple(found - entry for found, entry in zip(reached, held.values, strict=True)))
+    return scale * v, misses, jnp.maximum(asked.off_branch(v), asked.missed(v)), undecided
+
+
+@quick_compile
+def other_speeds(mechanism, held, t, q, v):
+    """Speeds on other branches than v, with those of joints held: candidates, (k, n_v), and which of them are some."""
+    configuration = configure(system_of(mechanism, q.dtype), t, q)
+    asked = _asked(configuration, held)
+    tolerance = rank_tolerance(q.dtype)
+
+    def found(begin):
+        other = _on_branch(asked, begin)
+        off = jnp.maximum(asked.off_branch(other), asked.missed(other))
+        # Speeds beside it on its own branch differ, too, where more than what is asked can move.
+        decided = invert(None, asked.slopes(other), asked.system.scales, tolerance).rank == len(v)
+        apart = asked.system.fastest(asked.scale * other - v) > APART * asked.system.fastest(v)
+        return asked.scale * other, (off <= ON_BRANCH * tolerance) & decided & apart
+
+    return lax.map(found, asked.aside(STARTS))

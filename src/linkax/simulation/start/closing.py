@@ -1,0 +1,182 @@
+"""Coordinates that close the loops, with those of some joints held."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from linkax.equations.configuration import configure
+from linkax.equations.coordinates import rates, retract, speeds
+from linkax.equations.loops import as_if_closed, flips, jacobian, residual
+from linkax.equations.system import System
+from linkax.linalg.while_falling import while_falling
+from linkax.model.terms import Term
+from linkax.simulation.start.nearest_solution import elastic_energy, nearest_solution, nearest_solution_in, strains_of
+from linkax.simulation.start.validation import JointValues
+from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
+from linkax.xla.derivatives import pushforward, ratio
+from linkax.xla.static_scatter import scatter_static
+
+MOST_STEPS = 100
+LONGEST_STEP = 0.7  # radians, or lengths of the mechanism
+STEP_FRACTIONS = 0.5 ** np.arange(6)
+SMALL = 1e-15
+CLOSED = 1e-9  # remaining gap, relative to the mechanism's length
+# Starts of the search beside the guess, by which it leaves a saddle of the gap, or a bad guess.
+ATTEMPTS = np.array([0.0, 1e-2, 1e-1, 0.3, 0.3, 0.6, 0.6, 1.0, 1.0, 1.0, 1.5, 1.5, 1.5, 1.5, 3.0, 3.0, 3.0, 3.0])
+# The same where strains move too, and what these count for next to the rows, little; where that stops short, nothing.
+STRAINED = np.array([[0.0, 1e-2, 1e-2, 0.0, 1e-2, 1e-2], [0.1, 0.1, 0.1, 0.0, 0.0, 0.0]])
+
+
+class LoopClosure(eqx.Module):
+    """Closed loops at time t, and coordinates of joints that are held at values."""
+
+    system: System
+    t: jax.Array
+    held: JointValues
+
+    def misses(self, configuration):
+        """How far what is held is from where it should be, one number for each speed."""
+        topology, apart = self.system.topology, []
+        for along, entry in zip(self.held.terms, self.held.values, strict=True):
+            kind = topology.joint_types[topology.joints.index(along.joint)]
+            turning = 3 * kind.has_quaternion
+            indices = range(turning, len(kind.speed_units)) if along.index is None else [along.index]
+            ends = entry[turning + kind.has_quaternion :] if along.index is None else entry
+            away = lambda index, end, name=along.joint: configuration.joint_displacement(Term(name, index), end)
+            missed = [away(index, end) for index, end in zip(indices, ends, strict=True)]
+            missed = [jnp.stack(missed)] if missed else []
+            if kind.has_quaternion and along.index is None:
+                found = configuration.joint_coordinates(along.joint)[:4]
+                missed.insert(0, rotation_vector(multiply(found, conjugate(entry[:4] / jnp.linalg.norm(entry[:4])))))
+            apart.append(jnp.concatenate([jnp.zeros(0, self.system.dtype), *missed]))
+        return tuple(apart)
+
+    def rows(self, configuration):
+        """All that must vanish: loop rows, axes that point apart, misses."""
+        return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(configuration)])
+
+    def linearised(self, q):
+        """The rows, and their derivative where the loops are closed; elsewhere the direction that closes them."""
+        configuration, held = configure(self.system, self.t, q), ()
+        if self.held.terms:
+            moved = lambda change: configure(self.system, self.t, retract(self.system.topology, q, change))
+            still = jnp.zeros(self.system.topology.num_speeds, q.dtype)
+            held = jax.jacfwd(lambda change: self.misses(moved(change)))(still)
+        close_loops = as_if_closed(configuration)
+        return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], *held])
+
+    def back(self, q, guess):
+        """The change that undoes that of the strains since a guess."""
+        change = speeds(self.system.topology, q, guess - q)
+        strains = strains_of(self.system)
+        return scatter_static(jnp.zeros_like(change), strains, change[strains])
+
+    def metrics(self):
+        """In radians and lengths of the mechanism, with strains by energy, over that of the softest or the hardest."""
+        strains, scales = strains_of(self.system), self.system.scales
+        energy = elastic_energy(self.system)
+        sizes = jnp.diagonal(energy) * scales[strains] ** 2
+        of = lambda size: jnp.diag(scales**-2).at[np.ix_(strains, strains)].set(energy / size)
+        return jax.vmap(of)(jnp.stack([jnp.min(sizes), jnp.max(sizes)]))
+
+    def descent(self, rows, slopes):
+        """The steepest descent of the rows' squares, without strains, as long as their linearisation says."""
+        strains = strains_of(self.system)
+        downhill = scatter_static(
+            -(self.system.scales**2) * (rows @ slopes), strains, jnp.zeros(len(strains), rows.dtype)
+        )
+        change = slopes @ downhill
+        scale = jnp.sum(change * change)
+        return downhill * ratio(-(rows @ change), scale, 0.0)
+
+    def meet(self, q, guess, moves, weight):
+        """Damped Newton steps from q until rows and strains vanish or stop falling; descent where those fail.
+
+        **Arguments:** `guess`: coordinates whose strains they lead back to; `moves`: which coordinates they change;
+        `weight`: of strains in radians and lengths of the mechanism, next to the rows.
+
+        **Returns:** where they lead, and the size of the rows there.
+        """
+        metrics = self.metrics() if len(strains_of(self.system)) else None
+
+        def newton(rows, slopes, back):
+            if metrics is None:
+                return nearest_solution(self.system, back, slopes, -rows)[None]
+            return jax.vmap(lambda metric: nearest_solution_in(metric, self.system.scales, back, slopes, -rows))(
+                metrics
+            )
+
+        def strained(q):
+            back = self.back(q, guess)
+            return jnp.zeros((), q.dtype) if metrics is None else weight * jnp.sqrt(back @ metrics[1] @ back)
+
+        def improve(state, _):
+            q, _ = state
+            rows, slopes = self.linearised(q)
+            slopes = jnp.where(moves, slopes, 0.0)
+            steps = [
+                newton(rows, slopes, jnp.where(weight > 0.0, self.back(q, guess), 0.0)),
+                self.descent(rows, slopes)[None],
+            ]
+            steps = jnp.concatenate(steps)
+            longest = jnp.max(jnp.abs(steps / self.system.scales), axis=1, keepdims=True, initial=0.0)
+            steps = steps * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0))
+            changes = (STEP_FRACTIONS[:, None, None] * steps).reshape(-1, steps.shape[1])
+            tries = jax.vmap(lambda change: retract(self.system.topology, q, change))(changes)
+            tries = jnp.concatenate([tries, q[None]])
+            sizes = jax.vmap(lambda q: _size(self.rows(configure(self.system, self.t, q))))(tries)
+            misses = sizes + jax.vmap(strained)(tries)
+            best = jnp.argmin(misses)
+            return (tries[best], sizes[best]), misses[best]
+
+        return while_falling(improve, (q, jnp.asarray(jnp.inf, q.dtype)), MOST_STEPS, SMALL, q.dtype)
+
+    def search(self, q):
+        """Coordinates that meet the demand, from q, or else from beside it; the nearest miss where none do."""
+        fixed = np.isin(np.arange(self.system.topology.num_speeds), strains_of(self.system))
+        # Beams are strained only where that leads to no closed loops, by what the nearest miss leaves open.
+        sizes, weights = np.concatenate(
+            [[ATTEMPTS, 0.0 * ATTEMPTS], [*STRAINED] if np.any(fixed) else 2 * [[]]], axis=1
+        )
+        beside = sizes[:, None] * np.random.default_rng(0).normal(size=(len(sizes), len(fixed)))
+        starts, weights = jnp.asarray(beside, q.dtype) * self.system.scales, jnp.asarray(weights, q.dtype)
+
+        def unfinished(carry):
+            count, _, size = carry
+            return (count < len(starts)) & (size > CLOSED)
+
+        def attempt(carry):
+            count, best, size = carry
+            strains = count >= len(ATTEMPTS)
+            moves = strains | jnp.logical_not(fixed)
+            begin, aside = jnp.where(strains, best, q), jnp.where(moves, starts[count], 0.0)
+            found, reached = self.meet(retract(self.system.topology, begin, aside), q, moves, weights[count])
+            return count + 1, jnp.where(reached < size, found, best), jnp.minimum(reached, size)
+
+        begin = (jnp.zeros((), int), q, jnp.asarray(jnp.inf, q.dtype))
+        return lax.while_loop(unfinished, attempt, begin)[1]
+
+
+def _size(rows):
+    return jnp.sqrt(jnp.sum(rows * rows))
+
+
+@eqx.filter_custom_jvp
+def close_loops(demand, q):
+    """Coordinates that meet a demand, by a search from q."""
+    return demand.search(q)
+
+
+@close_loops.def_jvp
+def _closed_jvp(primals, changes):
+    """Where the rows stay zero, nearest to the change of where the search begins; itself it has no derivative."""
+    (demand, begin), (change, begins) = primals, changes
+    q, topology = close_loops(demand, begin), demand.system.topology
+    along = jnp.zeros_like(demand.system.scales) if begins is None else speeds(topology, begin, begins)
+    at_rest = lambda demand: demand.rows(configure(demand.system, demand.t, q))
+    rows, opens = pushforward(at_rest, (demand,), (change,))
+    along = nearest_solution(demand.system, along, demand.linearised(q)[1], -opens)
+    # Loops that do not close stay as open as they were found.
+    return q, rates(topology, q, jnp.where(_size(rows) <= CLOSED, along, 0.0))

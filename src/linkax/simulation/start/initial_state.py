@@ -1,0 +1,111 @@
+"""What a state is, before motion starts from it: closed, on a branch of the motion, unique."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from linkax.equations.configuration import configure
+from linkax.equations.loops import gaps
+from linkax.equations.motion import move
+from linkax.equations.system import System
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.simulation.start.state import State
+from linkax.spatial.vectors import largest
+
+MOVES = 1e-6  # of the largest speed
+SINGULAR_ULPS = 8.0  # times the number of speeds: what rounding leaves of a singular mass matrix
+ON_BRANCH = 10.0  # rank tolerances that speeds may be off a branch, relative to their square
+
+
+class InitialCheck(NamedTuple):
+    """A state that motion starts from at time t [s], put on the closed loops.
+
+    - `singular`: the rank of J is smaller here than next to here.
+    - `rank`: of J at the states next to it along the motion, for each island of the mechanism, or each cell of its
+      chain where it has one.
+    - `definiteness`: of the mass matrix on the tangent space, see `linkax.linalg.constrained_solve.SaddleInverse`.
+    - `assembled`: not marked by `linkax.assemble`, by infinite speeds, as a state that it did not find.
+    - `finite`, `closed`; `massive`: all that can move has mass; `on_branch`: the speeds lie on a
+      branch of the motion; `unique`: so does, at rest, the acceleration.
+    """
+
+    t: Float[Array, ""]
+    state: State
+    singular: Bool[Array, ""]
+    rank: Int[Array, " k"]
+    definiteness: Float[Array, ""]
+    assembled: Bool[Array, ""]
+    finite: Bool[Array, ""]
+    massive: Bool[Array, ""]
+    closed: Bool[Array, ""]
+    on_branch: Bool[Array, ""]
+    unique: Bool[Array, ""]
+
+    @property
+    def can_start(self) -> Bool[Array, ""]:
+        """Motion can start from here."""
+        return self.finite & self.massive & self.closed & self.on_branch & self.unique
+
+    def of_numbers(self, sound) -> "InitialCheck":
+        """The same of a mechanism whose numbers are sound or not, which then is what is wrong."""
+        return self._replace(finite=self.finite & sound, assembled=self.assembled | jnp.logical_not(sound))
+
+
+def check_initial_state(method: TangentSpace, system: System, t, state: State) -> InitialCheck:
+    """Close a state and find the rank around it.
+
+    At rest the motion departs along the acceleration. In a singular configuration that is free
+    to take any direction that J leaves; on a branch only if the loops have no force that turns it.
+    """
+    q, v = method.close(system, t, state.q, state.v)
+    start, begins = State(q, v), lax.stop_gradient(t)
+    # All that follows only decides, and has no derivative.
+    method, system, t, given, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, state.q, q, v))
+    # A singular mass matrix has spoiled them.
+    q, v = jnp.where(jnp.all(jnp.isfinite(q)), q, given), jnp.where(jnp.isfinite(v), v, 0.0)
+    crossing, mass, acceleration, definiteness = method.at_rest(system, t, q)
+    eps = jnp.finfo(system.dtype).eps
+    massive = definiteness > SINGULAR_ULPS * eps * len(v)
+    assembled = jnp.logical_not(jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isposinf(state.v)) & (len(state.v) > 0))
+    finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & jnp.all(jnp.isfinite(mass))
+    finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, acceleration, 0.0)))
+    if system.topology.num_rows == 0:
+        true = jnp.ones((), bool)
+        sound = assembled, finite, massive, true, true, true
+        return InitialCheck(begins, start, jnp.zeros((), bool), crossing.inverse.rank, definiteness, *sound)
+    gap = gaps(crossing.configuration).in_scales(system)
+    small = jnp.sqrt(eps)
+    at_rest = system.fastest(v) ** 2 <= eps * system.fastest(acceleration)
+    direction = jnp.where(at_rest, acceleration, v)
+    off, rank = crossing.along(direction, at_rest)
+    # Rows that are not quite dependent contradict each other by as much.
+    on_branch = largest(off) <= ON_BRANCH * method.rank_tolerance
+    return InitialCheck(
+        t=begins,
+        state=start,
+        singular=jnp.any(rank > crossing.inverse.rank),
+        rank=method.ranks_along(system, t, q, direction, rank),
+        definiteness=definiteness,
+        assembled=assembled,
+        finite=finite,
+        massive=massive,
+        closed=gap.widest() <= small,
+        on_branch=on_branch | at_rest,
+        unique=on_branch | jnp.logical_not(at_rest),
+    )
+
+
+def moving_joints(system: System, t, q, directions) -> list[str]:
+    """Names of the joints, in the tree or cut, that move in some of the directions, (n_v, k)."""
+    size = np.max(np.abs(directions), initial=0.0)
+    configuration = configure(system, t, q)
+
+    def moves(name):
+        speeds = jax.vmap(lambda v: move(configuration, v).joint_speeds(name), in_axes=1)(directions)
+        return np.max(np.abs(speeds), initial=0.0) > MOVES * size
+
+    return [name for name in system.topology.joints if moves(name)]

@@ -1,0 +1,169 @@
+"""What users give for a mechanism, checked: numbers for joints, states, times."""
+
+from collections.abc import Mapping
+from functools import reduce
+from itertools import chain
+from operator import and_
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from linkax.model.functions import Law
+from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import is_finite, namespace, number, real, require, require_type
+from linkax.model.terms import Term, term
+from linkax.simulation.start.state import State
+from linkax.xla.tracing import concrete
+
+
+class JointValues(eqx.Module):
+    """Numbers that a user gives for joints.
+
+    - `terms`: whose they are; one number for a term with an index, else all of the joint's.
+    - `values`: as many arrays.
+    """
+
+    terms: tuple[Term, ...] = eqx.field(static=True)
+    values: tuple[jax.Array, ...]
+
+    def speeds(self, motion) -> list[jax.Array]:
+        """The speeds of these joints in a motion, in the shapes of `values`."""
+        of_joint = lambda along: motion.joint_speeds(along.joint)
+        return [of_joint(along) if along.index is None else of_joint(along)[along.index][None] for along in self.terms]
+
+
+def _is_law(node) -> bool:
+    return isinstance(node, Law)
+
+
+def check_mechanism(mechanism):
+    """Whether this is one mechanism, its functions are still the same, and JAX is in double precision."""
+    if not jax.config.jax_enable_x64:
+        raise ValueError(
+            "jax_enable_x64 is False, switched off after linkax was imported; switch it on again by "
+            'jax.config.update("jax_enable_x64", True), and for a run in single precision give dtype=jnp.float32'
+        )
+    require_type(
+        mechanism, Mechanism, "mechanism", "give a linkax.Mechanism, such as your function of parameters returns"
+    )
+    for law in filter(_is_law, jax.tree.leaves((mechanism.forces, mechanism.constraints), is_leaf=_is_law)):
+        law.check()
+    for body in mechanism.bodies:
+        if np.shape(body.mass) != ():
+            raise ValueError(
+                f"mechanism is a batch: body {body.name!r} has masses of shape {np.shape(body.mass)}; use jax.vmap, or "
+                "linkax.sweep, for the function that makes it and uses it"
+            )
+    if mechanism.topology.num_speeds == 0:
+        names = ", ".join(map(repr, mechanism.topology.joints))
+        raise ValueError(
+            f"mechanism cannot move, nor be computed: none of its joints {names} does; make one a joint that does"
+        )
+
+
+def sound_numbers(mechanism) -> Bool[Array, ""] | np.bool_:
+    """Whether no number of a mechanism that is or was traced is one that cannot be, see `linkax.model.numbers.require`.
+
+    What a user's own elements and functions hold is not looked at.
+    """
+    places = (mechanism.bodies, mechanism.beams, mechanism.joints, mechanism.forces, mechanism.constraints)
+    own = [element for element in chain(*places) if type(element).__module__.startswith("linkax.")]
+    leaves = jax.tree.leaves(own, is_leaf=_is_law)
+    # An array of NumPy was known when the mechanism was built, and checked there.
+    return reduce(and_, map(is_finite, filter(eqx.is_array, leaves)), np.True_)
+
+
+def marked(mechanism, found):
+    """What was found of a mechanism, with NaN for its numbers where `sound_numbers` is false."""
+    sound = sound_numbers(mechanism)
+    if concrete(sound):
+        return found
+    mark = lambda leaf: jnp.where(sound, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
+    return jax.tree.map(mark, found)
+
+
+def checked_time(entry, name: str):
+    """One time [s]."""
+    return number(entry, (), f"{name} [s]")
+
+
+def checked_state(mechanism, state) -> State:
+    """A state of a mechanism, in floating-point numbers, finite where they are known."""
+    check_mechanism(mechanism)
+    topology, made = mechanism.topology, "make the state with linkax.assemble"
+    require_type(state, State, "state", made)
+    found = []
+    for what, array, slices, size in (
+        ("q", state.q, topology.coordinates, topology.num_coordinates),
+        ("v", state.v, topology.speeds, topology.num_speeds),
+    ):
+        if not (eqx.is_array(array) and jnp.issubdtype(array.dtype, jnp.floating)):
+            array = real(array, f"state.{what}")
+        if array.shape != (size,):
+            raise ValueError(
+                f"state.{what} has shape {array.shape}; this mechanism's tree has {topology.num_coordinates} "
+                f"coordinates and {topology.num_speeds} speeds: {made}"
+            )
+        found.append(array)
+        if (entries := concrete(array)) is None:
+            continue
+        for (name, taken), kind in zip(slices.items(), topology.joint_types, strict=False):
+            of_joint = f"state.{what} of joint {name!r}"
+            require(entries[taken], is_finite, of_joint, "it must be finite")
+            if kind.has_quaternion and what == "q":
+                _check_quaternion(entries[taken], of_joint)
+    return State(*found)
+
+
+def _check_quaternion(coordinates, what):
+    """Coordinates that begin with a quaternion that is a rotation."""
+
+    def turns(entries):
+        size = namespace(entries).linalg.norm(entries[:4])
+        return (size > 0.0) & (size < np.inf)
+
+    with np.errstate(over="ignore"):
+        return require(
+            coordinates, turns, what, "its quaternion is no rotation; give one of length 1, like (1, 0, 0, 0)"
+        )
+
+
+def by_joint(mechanism: Mechanism, given, what: str, count) -> JointValues:
+    """Numbers for joints, checked: {joint or (joint, index): number or array}; `count` tells how many a joint has."""
+    terms, values = [], []
+    given = {} if given is None else given
+    require_type(given, Mapping, what, "give {joint: number, ...}")
+    for key, entry in given.items():
+        along = term(key, what)
+        joint = mechanism.joint(along.joint)
+        expected = count(joint) if along.index is None else 1
+        if along.index is not None and not 0 <= along.index < len(joint.speed_units):
+            most = len(joint.speed_units)
+            raise ValueError(
+                f"{what} of joint {joint.name!r}: index {along.index}; it has {most} speeds, counted from 0"
+            )
+        of_joint = f"{what} of joint {joint.name!r}"
+        array = real(entry, of_joint)
+        if array.shape == () and expected != 1:
+            raise ValueError(f"{of_joint} is one number; the joint has {expected} of them")
+        terms.append(along)
+        values.append(number(array[None] if array.shape == () else array, (expected,), of_joint))
+    return JointValues(tuple(terms), tuple(values))
+
+
+def coordinates_by_joint(mechanism: Mechanism, given, what: str) -> JointValues:
+    """Coordinates of joints, quaternions whole and not zero."""
+    found, values = by_joint(mechanism, given, what, lambda joint: joint.num_coordinates), []
+    for along, entry in zip(found.terms, found.values, strict=True):
+        joint = mechanism.joint(along.joint)
+        if joint.has_quaternion and along.index is None:
+            entry = _check_quaternion(entry, f"{what} of joint {joint.name!r}")
+        if joint.has_quaternion and along.index in (0, 1, 2):
+            raise ValueError(
+                f"{what} of joint {joint.name!r}: index {along.index} is part of a quaternion; give all of it"
+            )
+        values.append(entry)
+    return JointValues(found.terms, tuple(values))

@@ -1,0 +1,53 @@
+"""Functions that are computed in another way in a batch: JAX's own rules cost too much there, or hang."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+SMALL = 32  # rows, up to which elimination serves batches
+
+
+def one_by_one(function):
+    """A function of pytrees that calls LAPACK, for one member of a batch after another on a CPU.
+
+    jaxlib (0.10) spreads a LAPACK call for a batch over the threads that the program itself runs in, and waits for
+    them: two such calls at once wait for each other for ever. Derivatives are those of the function as it is.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def single(*arrays):
+        return function(*arrays)
+
+    @single.def_vmap
+    def _(size, batched, *arrays):
+        each = lambda array, of_batch: array if of_batch else jnp.broadcast_to(array, (size, *jnp.shape(array)))
+        arrays = jax.tree.map(each, arrays, tuple(batched))
+        mapped = lambda *arrays: lax.map(lambda members: single(*members), arrays)
+        found = lax.platform_dependent(*arrays, cpu=mapped, default=jax.vmap(function))
+        return found, jax.tree.map(lambda _: True, found)
+
+    differentiable = jax.custom_jvp(single)
+    differentiable.defjvp(lambda primals, changes: jax.jvp(function, primals, changes))
+    return differentiable
+
+
+def small_in_batches(single, batched):
+    """A function of a matrix, computed in another way in batches of small ones."""
+
+    @jax.custom_batching.custom_vmap
+    def function(matrix):
+        outer, shape = matrix.shape[:-2], matrix.shape[-2:]
+        if not outer:
+            return (batched if shape[0] <= SMALL else single)(matrix)
+        mapped = jax.vmap(batched if shape[0] <= SMALL else one_by_one(single))
+        found = mapped(matrix.reshape(math.prod(outer), *shape))
+        return jax.tree.map(lambda part: part.reshape(*outer, *part.shape[1:]), found)
+
+    @function.def_vmap
+    def _(_size, _batched, matrix):
+        found = function(matrix)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return function

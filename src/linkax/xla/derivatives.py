@@ -1,0 +1,52 @@
+"""Derivatives as linkax needs them: None for zero, whole Jacobians, quotients without NaN."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+
+def ratio(a, b, otherwise):
+    """a / b where b > 0, elsewhere another value; its derivatives hold no NaN of the branch not taken."""
+    return jnp.where(b > 0.0, a / jnp.where(b > 0.0, b, 1.0), otherwise)
+
+
+def materialise(primal, change):
+    """A change as an array: of zeros, where None stands for none."""
+    return jnp.zeros_like(primal) if change is None else change
+
+
+def pushforward(function, primals, changes):
+    """Value and change of a function, like `equinox.filter_jvp`, which gives None for no change; this gives zeros."""
+    found, change = eqx.filter_jvp(function, primals, changes)
+    numbers, _ = eqx.partition(found, eqx.is_inexact_array)
+    return found, jax.tree.map(materialise, numbers, change)
+
+
+def whole_jacobian(function):
+    """A function (static, *arrays) of few numbers each whose derivative is found once, for all directions.
+
+    A Jacobian by many directions, of which few concern this function, then costs no more than its own.
+    """
+
+    @partial(jax.custom_jvp, nondiff_argnums=(0,))
+    def whole(static, *arrays):
+        return function(static, *arrays)
+
+    def rule(static, arrays, changes):
+        moves = [type(change) is not jax.custom_derivatives.SymbolicZero for change in changes]
+        moving = lambda values: [value for value, of in zip(values, moves, strict=True) if of]
+        at, restored = ravel_pytree(moving(arrays))
+
+        def of_moving(flat):
+            moved = iter(restored(flat))
+            return function(static, *(next(moved) if of else array for array, of in zip(arrays, moves, strict=True)))
+
+        slopes = jax.vmap(lambda change: jax.jvp(of_moving, (at,), (change,))[1])(jnp.eye(len(at), dtype=at.dtype))
+        change = ravel_pytree(moving(changes))[0]
+        return function(static, *arrays), jax.tree.map(lambda slope: jnp.tensordot(change, slope, 1), slopes)
+
+    whole.defjvp(rule, symbolic_zeros=True)
+    return whole

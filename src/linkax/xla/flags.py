@@ -1,0 +1,79 @@
+"""Flags and options of XLA, the compiler behind JAX.
+
+XLA makes a kernel of each operation that it cannot fuse with others, and on a CPU it takes some 50 ns to start one:
+longer than it runs, where a mechanism is small. A loop on few numbers XLA compiles into one kernel instead, unless it
+calls a library, as for products of matrices (see `linkax.xla.products_as_sums`). What is few is set by a flag
+that it reads once in a process, when JAX makes its first array. XLA ends the process for a flag that it does not know,
+so this one is an option among others in a list that it does not check. Another, that leaves fewer products to a library
+in batches, is given to versions that are known to know it.
+
+What a version of XLA does is tried, as versions tell too little.
+
+Most of the time to compile goes into optimisations, which a program that runs once does not earn back.
+"""
+
+import os
+import warnings
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+from jax import lax
+
+WHOLE_LOOP_BYTES = 2**22  # read and written by one pass of a loop
+LOOP_BYTES = "xla_cpu_small_while_loop_byte_threshold"
+LOOPS = f"--xla_backend_extra_options={LOOP_BYTES}={WHOLE_LOOP_BYTES}"
+PRODUCTS = "--xla_cpu_experimental_ynn_fusion_type="
+KNOWN_VERSIONS = ("0.10.", "0.11.", "0.12.")  # of jaxlib, that know it
+QUICK = {  # to compile, not to run
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_use_fusion_emitters": False,
+}
+
+
+def set_flags():
+    """Add to `XLA_FLAGS` what it does not name yet."""
+    given, flags = os.environ.get("XLA_FLAGS", ""), [LOOPS]
+    if jaxlib.__version__.startswith(KNOWN_VERSIONS):
+        flags.append(PRODUCTS)
+    added = [flag for flag in flags if flag.partition("=")[0] not in given]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+
+
+@cache
+def quickest_to_compile() -> dict:
+    """Options of `jax.jit`, as far as XLA knows them: half of the time to compile and less, for a slower program."""
+    return {name: value for name, value in QUICK.items() if _is_known({name: value})}
+
+
+def _is_known(options) -> bool:
+    try:
+        jax.jit(lambda: 0, compiler_options=options).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+@cache
+def makes_kernels_of_loops() -> bool:
+    """Whether XLA makes one kernel of a loop like those of `linkax.xla.one_kernel.in_one_kernel`.
+
+    It does not where JAX had made an array before linkax was imported, where `XLA_FLAGS` say otherwise, and
+    in versions that know no such kernels. Warns, unless `XLA_FLAGS` ask for it, where runs on a CPU are slow for that.
+    """
+    with jax.ensure_compile_time_eval():
+        step = lambda carry: (carry[0] + 1, jnp.sin(jnp.sum(carry[1][:, :, None] * carry[1], axis=1)))
+        loop = jax.jit(lambda count, matrix: lax.while_loop(lambda carry: carry[0] < 3, step, (count, matrix)))
+        program = loop.lower(0, jax.ShapeDtypeStruct((8, 8), jnp.float64)).compile().as_text()
+    made, flags = "xla_cpu_small_call" in program, os.environ.get("XLA_FLAGS", "")
+    chosen = LOOP_BYTES in flags and LOOPS not in flags
+    if not made and not chosen and jax.default_backend() == "cpu":
+        warnings.warn(
+            f"runs take about five times as long as they could: jaxlib {jaxlib.__version__} makes no kernels of loops; "
+            f"import linkax before JAX makes its first array, with {LOOPS} in XLA_FLAGS, or install another jaxlib",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return made

@@ -1,0 +1,62 @@
+"""Room for compiled programs.
+
+Each program holds memory maps, of which Linux gives a process 65 530. Where XLA gets no more it ends the process.
+"""
+
+import gc
+import warnings
+from pathlib import Path
+
+import equinox as eqx
+import jax
+
+COMPILING = "/jax/core/compile/backend_compile_duration"  # what JAX tells its listeners before XLA compiles, and after
+ROOM = 10_000  # memory maps; the largest programs of linkax take 4000
+MAPS, LIMIT_OF_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+
+
+def watch_memory_maps():
+    """Make room before any program of this process is compiled."""
+    jax.monitoring.register_scalar_listener(make_room)
+
+
+def make_room(event, *_time, **_what):
+    """Forget compiled programs where memory maps may not suffice for another one.
+
+    **Raises:** `RuntimeError` where other things hold the maps. XLA would end the process.
+    """
+    if event != COMPILING or _has_room():
+        return
+    eqx.clear_caches()
+    jax.clear_caches()
+    gc.collect()
+    limit = _limit_of_maps()
+    remedy = f"raise their limit (sysctl -w vm.max_map_count={4 * limit})"
+    if not _has_room():
+        raise RuntimeError(
+            f"compiled programs in use and mapped files hold {_maps()} memory maps, of which this process may have "
+            f"{limit}: too many to compile another program; hold fewer, {remedy}, or go on in another process"
+        )
+    warnings.warn(
+        f"compiled programs held nearly all of the {limit} memory maps that this process may have: JAX's caches have "
+        f"been cleared, and what is used again compiles again; to keep more programs {remedy}",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+
+
+def _has_room() -> bool:
+    """Whether memory maps suffice for another program; true where nothing tells."""
+    try:
+        limit = _limit_of_maps()
+        return limit - _maps() >= min(ROOM, limit // 4)
+    except (OSError, ValueError):
+        return True
+
+
+def _maps() -> int:
+    return MAPS.read_bytes().count(b"\n")
+
+
+def _limit_of_maps() -> int:
+    return int(LIMIT_OF_MAPS.read_text())

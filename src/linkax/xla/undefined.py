@@ -1,0 +1,59 @@
+"""Derivatives that do not exist, as numbers that are none.
+
+JAX gives zero where a result does not follow its inputs, and zero says "at an optimum" to whoever descends along it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from linkax.xla.derivatives import materialise
+from linkax.xla.primitives import primitive
+
+
+@eqx.filter_custom_jvp
+def undefined_where(undefined, values, inputs):
+    """Values as they are, without derivatives by `inputs` where `undefined`.
+
+    Forwards these are not a number. Backwards so are the cotangents of all inputs, but for values that had no
+    cotangent: those that a loss leaves out, such as failed members of a batch, spoil nothing.
+
+    **Arguments:** `values`: pytree of arrays; `undefined`: of booleans that broadcast to them; `inputs`: what the
+    values were computed from.
+    """
+    return values
+
+
+@undefined_where.def_jvp
+def _undefined_where_jvp(primals, changes):
+    (undefined, values, _), (_, to_values, to_inputs) = primals, changes
+    to_values, restored = ravel_pytree(jax.tree.map(materialise, values, to_values))
+    undefined, _ = ravel_pytree(jax.tree.map(lambda none, of: jnp.broadcast_to(none, of.shape), undefined, values))
+    # What all inputs have in common: through it their cotangents are reached. Of a batch, all of it is one.
+    common = sum(map(jnp.sum, jax.tree.leaves(to_inputs)), jnp.zeros((), to_values.dtype))
+    linear = jnp.append(to_values, common) + 0.0 * jnp.append(undefined, False)
+    return values, restored(_spoiled(undefined, linear))
+
+
+def _spoil(undefined, linear):
+    return jnp.where(undefined, jnp.nan, linear[:-1])
+
+
+def _abstract(undefined, linear):
+    return jax.core.ShapedArray(undefined.shape, linear.dtype)
+
+
+def _jvp(primals, changes):
+    (undefined, linear), (_, change) = primals, changes
+    return _spoil(undefined, linear), _spoiled(undefined, change)
+
+
+def _transpose(arguments, cotangent):
+    undefined, _ = arguments
+    spoilt = undefined & (cotangent != 0.0)
+    of_inputs = jnp.where(jnp.any(spoilt), jnp.nan, 0.0).astype(cotangent.dtype)
+    return None, jnp.append(jnp.where(spoilt, jnp.nan, cotangent), of_inputs)
+
+
+_spoiled = primitive("undefined_where", _spoil, _abstract, _jvp, _transpose)
