@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from compiled_as_users_do import motion
 
-from linkax.xla import flags
+from linkax.xla import flags as xla_flags
+from linkax.xla import memory_maps
 from linkax.xla.flags import LOOPS, makes_kernels_of_loops, quickest_to_compile, set_flags
 from linkax.xla.memory_maps import ROOM
 from linkax.xla.tracing import quick_compile
@@ -82,7 +83,7 @@ def test_slow_loops_are_told_once_unless_asked_for(monkeypatch):
 def test_options_that_a_version_does_not_know_are_left_out(monkeypatch):
     known = quickest_to_compile()
     assert known
-    monkeypatch.setattr(flags, "QUICK", known | {"xla_cpu_no_such_option": True})
+    monkeypatch.setattr(xla_flags, "QUICK", known | {"xla_cpu_no_such_option": True})
     assert quickest_to_compile.__wrapped__() == known
 
 
@@ -112,8 +113,8 @@ def test_what_runs_once_has_no_part_in_transformations_of_others():
 def _with_limit(monkeypatch, folder, *free):
     """As if the process had so many memory maps left, one after another; the last one stays."""
     left = iter([*free[:-1], *[free[-1]] * 100])
-    monkeypatch.setattr(flags, "_maps", lambda: flags._limit_of_maps() - next(left))
-    monkeypatch.setattr(flags, "LIMIT_OF_MAPS", folder / "limit")
+    monkeypatch.setattr(memory_maps, "_maps", lambda: memory_maps._limit_of_maps() - next(left))
+    monkeypatch.setattr(memory_maps, "LIMIT_OF_MAPS", folder / "limit")
     (folder / "limit").write_text("70000\n")
 
 
@@ -137,7 +138,7 @@ def test_programs_are_forgotten_where_memory_maps_run_out(monkeypatch, tmp_path)
 
     assert kept(1.0) == kept(1.0) == 2.0
     assert len(traces) == 1
-    assert flags._limit_of_maps() - flags._maps() > ROOM
+    assert memory_maps._limit_of_maps() - memory_maps._maps() > ROOM
     _with_limit(monkeypatch, tmp_path, *[ROOM - 1, ROOM] * 2, 70_000)
     with pytest.warns(RuntimeWarning, match=r"nearly all of the 70000 memory maps .* vm\.max_map_count=280000") as told:
         found = both(0.5)
@@ -157,7 +158,7 @@ def test_no_program_is_compiled_where_memory_maps_are_held(monkeypatch, tmp_path
 def test_systems_that_tell_no_limit_are_left_alone(monkeypatch, tmp_path):
     for missing in ("MAPS", "LIMIT_OF_MAPS"):
         with monkeypatch.context() as patch:
-            patch.setattr(flags, missing, tmp_path / "none")
+            patch.setattr(memory_maps, missing, tmp_path / "none")
             assert jax.jit(lambda x: x + 1.0)(1.0) == 2.0
 
 

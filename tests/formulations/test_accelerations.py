@@ -73,7 +73,7 @@ def test_names_combine():
     assert found.acceleration.inverse == "svd"
     assert (found.stabilisation.alpha, found.stabilisation.beta) == (5.0, 5.0)
     assert isinstance(found.correction, lx.MassOrthogonalProjection)
-    assert formulation("tangent-space") is None
+    assert isinstance(formulation("tangent-space"), lx.TangentSpace)
     assert dataclasses.replace(found, correction=None).correction is None
 
 

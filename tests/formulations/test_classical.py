@@ -95,5 +95,5 @@ def test_dependent_rows_stop_multipliers_with_an_error_that_says_so():
 
 
 def test_what_is_no_formulation():
-    with pytest.raises(ValueError, match=r"formulation is 3; give a name, a linkax.ClassicalFormulation, or None"):
+    with pytest.raises(ValueError, match=r"formulation is 3; give a name, linkax.TangentSpace\(\) or a"):
         lx.simulate(*start("pendulum"), t1=1.0, formulation=3)

@@ -66,8 +66,9 @@ CALLS = {
     "body of a mechanism": (MECHANISM.body, {"name": "link"}),
     "joint of a mechanism": (MECHANISM.joint, {"name": "pin"}),
     "Accuracy": (lx.Accuracy, {
-        "rtol": 1e-8, "atol": 1e-8, "projection": "both", "rank_tolerance": 1e-6, "clearance": 0.0, "metric": "mass",
+        "rtol": 1e-8, "atol": 1e-8, "projection": "both", "clearance": 0.0,
     }),
+    "TangentSpace": (lx.TangentSpace, {"rank_tolerance": 1e-6, "metric": "mass", "corrections": 1}),
     "Baumgarte": (lx.Baumgarte, {"alpha": 1.0, "beta": 1.0}),
     "Positive": (lx.Positive, {"value": 1.0}),
     "Bounded": (lx.Bounded, {"value": 0.5, "lower": 0.0, "upper": 1.0}),

@@ -15,9 +15,9 @@ from plans import FEW
 from refusals import Shown, refused
 
 import linkax as lx
-from linkax.simulation import simulate
-from linkax.simulation.start import assembly
+from linkax.simulation.integrate.run import Run, checked_formulation
 from linkax.simulation.start.validation import sound_numbers
+from linkax.xla import tracing
 
 MECHANISM = crank_slider()
 N_Q, N_V = MECHANISM.topology.num_coordinates, MECHANISM.topology.num_speeds
@@ -42,8 +42,7 @@ def _nothing_compiled(monkeypatch):
     def never(*arguments):
         pytest.fail("refused only after a program was made")
 
-    for module, function in ((simulate, "_start"), (simulate, "_integrate"), (assembly, "_assemble")):
-        monkeypatch.setattr(module, function, never)
+    monkeypatch.setattr(tracing.Program, "choose", never)
 
 
 NO_NUMBER = [np.nan, np.inf, None, "long", "1.0", 1.0j, True, [1.0, 2.0], jnp.asarray([1.0]), jnp.asarray(np.nan), {}]
@@ -125,10 +124,13 @@ def test_an_unknown_option_is_named():
 ACCURACY = {
     "rtol": [0.0, -1e-8, 2.0, 1e308, *NO_NUMBER[:8]],
     "atol": [0.0, -1e-8, 1e308, np.nan, "fine", True],
-    "rank_tolerance": [0.0, -1.0, np.inf, "fine"],
     "clearance": [-1e-2, np.nan, "far", True],
     "projection": ["always", None, True],
+}
+TANGENT_SPACE = {
+    "rank_tolerance": [0.0, -1.0, np.inf, "fine"],
     "metric": ["euclid", 3, None],
+    "corrections": [0, -1, 1.5, None],
 }
 
 
@@ -137,6 +139,20 @@ def test_bad_accuracies_are_named(name):
     for value in ACCURACY[name]:
         if not (name == "atol" and value is None):
             refused(lambda value=value: lx.Accuracy(**{name: value}), name, Shown(value))
+
+
+@pytest.mark.parametrize("name", TANGENT_SPACE)
+def test_bad_numbers_of_the_tangent_space_are_named(name):
+    for value in TANGENT_SPACE[name]:
+        refused(lambda value=value: lx.TangentSpace(**{name: value}), name, Shown(value))
+
+
+def test_numbers_of_the_tangent_space_in_an_accuracy_hold_and_warn():
+    with pytest.warns(DeprecationWarning, match="give formulation=linkax.TangentSpace"):
+        accuracy = lx.Accuracy(1e-6, metric="identity", rank_tolerance=1e-5)
+    run = Run.of_state(MECHANISM, STATE, 0.0, checked_formulation("tangent-space", accuracy), accuracy)
+    assert run.tangent_space.metric == "identity"
+    assert run.tangent_space.rank_tolerance == 1e-5
 
 
 READERS = {

@@ -349,7 +349,7 @@ def _linear_subspace(system):
     screws = np.array([kind.is_screw for kind in topology.joint_types[: topology.num_bodies]])[topology.moved_body]
     if not np.any(screws):
         return subspace
-    return jnp.where(screws[:, None], system.number[topology.moved_body][:, None], 1.0) * subspace
+    return jnp.where(screws[:, None], system.joint_parameter[topology.moved_body][:, None], 1.0) * subspace
 
 
 def _along_path_product(topology, relative):

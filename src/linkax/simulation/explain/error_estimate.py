@@ -52,8 +52,7 @@ def part_of_run(solution, state: State, ts) -> Run:
 
 def num_saves(solution) -> int:
     """States that a part of a run saves at most."""
-    saves_times = solution.run.options.saveat is not None
-    return len(solution.ts) if saves_times and len(solution.ts) >= FEWEST else DEFAULT_SAVES
+    return len(solution.ts) if solution.run.saves_times and len(solution.ts) >= FEWEST else DEFAULT_SAVES
 
 
 def has_parts(solution) -> bool:

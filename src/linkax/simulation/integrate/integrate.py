@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool
 from linkax.equations.system import system_of
 from linkax.simulation.integrate.discrete_adjoint import Found, Integrator, integrate, solve_by_diffrax
 from linkax.simulation.integrate.map_saved_times import map_saved_times
-from linkax.simulation.integrate.options import saved_times, saves_times
+from linkax.simulation.integrate.options import saved_times
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.projected_solver import ProjectedSolver
 from linkax.simulation.integrate.results import ENDED_WELL, RESULTS
@@ -42,7 +42,7 @@ def integrate_run(run: Run) -> Outcome:
         initial = initial.of_numbers(sound)
     found = _integrate.choose(run.quick, run, initial)(run, initial)
     saveat = run.options.saveat
-    given = (found.ts, found.t_end), (found.ys, found.y_end), saves_states(saveat), _firsts(saveat)
+    given = (found.ts, found.t_end), (found.ys, found.y_end), saves_states(saveat), _firsts(run)
     given = run.mechanism, run.formulation, run.accuracy, initial, *given
     return Outcome(initial, found, *_closed.choose(run.quick, *given)(*given))
 
@@ -159,9 +159,9 @@ def _without_derivatives(found: Found, event, inputs) -> Found:
     return found._replace(ts=ts, ys=ys, t_end=t_end, y_end=y_end)
 
 
-def _firsts(saveat):
+def _firsts(run):
     """For each saved time the first row of that time, which may come more than once; None where times are traced."""
-    ts = concrete(saveat.subs.ts) if saves_times(saveat) else None
+    ts = concrete(run.options.saveat.subs.ts) if run.saves_times else None
     return None if ts is None else np.searchsorted(ts, ts)
 
 

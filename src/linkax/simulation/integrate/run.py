@@ -1,5 +1,6 @@
 """A run: what is to be integrated, how, and what is saved of it, checked once and carried whole."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
@@ -51,12 +52,23 @@ class DiffraxOptions(NamedTuple):
     progress_meter: diffrax.AbstractProgressMeter | None = None
 
 
+class _Frozen(eqx.Module):
+    """A pytree of which only arrays are leaves, so that JAX transformations can return it."""
+
+    arrays: Any
+    rest: Any = eqx.field(static=True)
+
+    @staticmethod
+    def of(tree) -> "_Frozen":
+        return _Frozen(*eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array | np.ndarray)))
+
+
 class Run(eqx.Module):
     """One run of a mechanism from a state at t0 to t1 [s], as `linkax.simulate` was asked for it.
 
     - `formulation`: of the equations of motion. `accuracy`: tolerances and projection.
     - `optimise`: see `linkax.simulate`.
-    - `options`: diffrax's objects, held as arrays and the rest, so that a solution may hold a run.
+    - `saves_times`: whether states are saved at given times, and nothing else.
     """
 
     mechanism: Mechanism
@@ -66,13 +78,8 @@ class Run(eqx.Module):
     formulation: AbstractFormulation
     accuracy: Accuracy
     optimise: bool = eqx.field(static=True)
-    _arrays: DiffraxOptions
-    _rest: DiffraxOptions = eqx.field(static=True)
-
-    def __init__(self, mechanism, state, t0, t1, formulation, accuracy, optimise, options: DiffraxOptions):
-        self.mechanism, self.state, self.t0, self.t1 = mechanism, state, t0, t1
-        self.formulation, self.accuracy, self.optimise = formulation, accuracy, optimise
-        self._arrays, self._rest = eqx.partition(options, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
+    saves_times: bool = eqx.field(static=True)
+    _options: DiffraxOptions | _Frozen
 
     @staticmethod
     def of(mechanism, state, *, t0, t1, accuracy, formulation, dtype, optimise, **given) -> "Run":
@@ -90,12 +97,13 @@ class Run(eqx.Module):
         formulation = checked_formulation(formulation, accuracy)
         options = _filled_in(mechanism, accuracy, t0, t1, **given)
         mechanism, state, t0, accuracy = cast((mechanism, state, t0, accuracy), dtype)
-        return Run(mechanism, state, t0, t1, formulation, accuracy, optimise, options)
+        saves = saves_times(options.saveat)
+        return Run(mechanism, state, t0, t1, formulation, accuracy, optimise, saves, options)
 
     @staticmethod
     def of_state(mechanism, state, t, formulation, accuracy) -> "Run":
         """What a state alone says of a run: nothing is stepped."""
-        return Run(mechanism, state, t, t, formulation, accuracy, True, DiffraxOptions(None, None, None, None))
+        return Run(mechanism, state, t, t, formulation, accuracy, True, False, DiffraxOptions(None, None, None, None))
 
     @property
     def is_integrated(self) -> bool:
@@ -105,7 +113,8 @@ class Run(eqx.Module):
     @property
     def options(self) -> DiffraxOptions:
         """diffrax's objects."""
-        return eqx.combine(self._arrays, self._rest)
+        options = self._options
+        return eqx.combine(options.arrays, options.rest) if isinstance(options, _Frozen) else options
 
     @property
     def control(self) -> MechanismControl:
@@ -139,17 +148,17 @@ class Run(eqx.Module):
     def changed(self, **changes) -> "Run":
         """The same run with other fields, or other objects of diffrax."""
         options = {name: changes.pop(name) for name in DiffraxOptions._fields if name in changes}
-        fields = {name: getattr(self, name) for name in _FIELDS} | changes
-        return Run(**fields, options=self.options._replace(**options))
+        if "saveat" in options:
+            changes["saves_times"] = saves_times(options["saveat"])
+        return dataclasses.replace(self, **changes, _options=self.options._replace(**options))
 
     def remembered(self) -> "Run":
         """What a solution keeps: to run it again, or a part of it, without the functions of a user."""
-        saveat = self.options.saveat if saves_times(self.options.saveat) else None
-        return self.changed(saveat=saveat, adjoint=None, event=None, progress_meter=None)
+        dt0, solver, controller, max_steps, *_ = self.options
+        return dataclasses.replace(self, _options=_Frozen.of(DiffraxOptions(dt0, solver, controller, max_steps)))
 
 
 _DECIDE = ("solver", "saveat", "event", "max_steps")
-_FIELDS = ("mechanism", "state", "t0", "t1", "formulation", "accuracy", "optimise")
 
 
 def checked_formulation(formulation, accuracy: Accuracy = None) -> AbstractFormulation:
