@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from mechanisms import four_bar
 
 import linkax as lx
 from linkax.formulations import projected_state
@@ -42,7 +41,11 @@ def depths():
         for name in ("split", "correct_position", "correct_velocity", "solve_accelerations"):
             watch(TangentSpace, name, patch)
         watch(projected_state, "gamma", patch)
-        mechanism = MECHANISM
+        # Names of its own, so that no other test has traced it.
+        crank, slide = lx.rod("watched_crank", 1.0, 1.0), lx.rod("watched_rod", 1.5, 1.0)
+        pins = lx.Revolute("foot", lx.GROUND, crank, "z"), lx.Revolute("knee", crank.at("tip"), slide, "z")
+        foot = lx.Revolute("hand", lx.GROUND.at([1.0, 0.0, 0.0]), slide.at("tip"), "z")
+        mechanism = lx.Mechanism([crank, slide], [*pins, foot])
         lx.simulate(mechanism, lx.assemble(mechanism), t1=1e-3)
     return found
 

@@ -17,11 +17,12 @@ from mechanisms import POOL, crank_slider, with_cut
 
 import linkax as lx
 from linkax.equations import dynamics, loops
-from linkax.equations.configuration import bodies_of_cuts, configure, sum_by_speed
+from linkax.equations.configuration import bodies_of_cuts, configure
 from linkax.equations.coordinates import neutral, on_manifold, rates, retract
 from linkax.equations.motion import move
 from linkax.equations.reactions import cut_reactions, reactions, seen_from
 from linkax.equations.system import system_of
+from linkax.equations.tree_sums import sum_by_speed
 from linkax.model.beams import BeamElasticity
 from linkax.spatial.vectors import cross
 

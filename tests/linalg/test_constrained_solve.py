@@ -10,7 +10,8 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from linkax.linalg.constrained_solve import constrained_solve, invert, invert_apart, least_multipliers, with_mass
+from linkax.linalg.constrained_solve import constrained_solve, invert, invert_apart, with_mass
+from linkax.linalg.least_multipliers import least_multipliers
 
 TOLERANCE = 1e-10
 METRICS = ["mass", "identity"]

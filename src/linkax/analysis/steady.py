@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
 from linkax.equations.dynamics import applied_load, inertial_wrench
-from linkax.equations.loops import gaps, jacobian, rate
+from linkax.equations.gaps import gaps
+from linkax.equations.loops import jacobian, rate
 from linkax.equations.motion import Motion
 from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace

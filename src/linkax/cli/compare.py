@@ -52,7 +52,7 @@ def _compare(arguments):
     if arguments.equal == "cost":
         names = {TANGENT_SPACE: formulation(TANGENT_SPACE)} | names
     mechanism = asked.mechanism.with_all_rows() if arguments.all_rows else asked.mechanism
-    settings = asked.described | {
+    settings = asked.display_name | {
         "formulations": list(names),
         "bound_given": arguments.bound,
         "equal": EQUAL[arguments.equal],

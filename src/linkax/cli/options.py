@@ -56,7 +56,7 @@ class RunOptions:
         else:
             self.solver = SOLVERS[asked]()
         self.points = self.scene.points(self.parameters)
-        self.described = {
+        self.display_name = {
             "scene": self.scene.name,
             "variant": self.variant,
             "t1": self.t1,

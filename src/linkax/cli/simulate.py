@@ -37,7 +37,7 @@ def add_command(commands):
 
 def _simulate(arguments):
     asked, chosen = RunOptions(arguments), formulation(arguments.formulation)
-    settings = asked.described | {"formulation": arguments.formulation}
+    settings = asked.display_name | {"formulation": arguments.formulation}
     out = output_folder(arguments.out, asked.scene.name, settings, ("summary.json", PART[1]))
     at_interrupt_in(out)
     state = asked.initial(asked.mechanism)

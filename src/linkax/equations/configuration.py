@@ -5,30 +5,25 @@ topology's `path`; only orientations need products along the way (by pointer dou
 Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 4, gives the recursions.
 """
 
-from functools import partial
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from linkax.equations.coordinates import coordinates_by_speed
+from linkax.equations.joint_motions import joint_motions
 from linkax.equations.system import System
+from linkax.equations.tree_sums import along_path, over_subtree, product_along_path, sum_by_speed
 from linkax.linalg.static_sparse import constant_product
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.forces import Load
 from linkax.model.joints.bending import section_at
-from linkax.model.joints.joint import RelativeMotion
 from linkax.model.numbers import value
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, rotate, transpose
-from linkax.spatial.screws import turn_rate
 from linkax.spatial.vectors import cross, dot
-from linkax.xla.derivatives import whole_jacobian
-from linkax.xla.static_scatter import scatter_static
 from linkax.xla.tracing import jit_inline
 
 
@@ -164,38 +159,6 @@ def wrapped(angles, is_angle):
     return jnp.where(is_angle, jnp.mod(angles + jnp.pi, 2.0 * jnp.pi) - jnp.pi, angles)
 
 
-def along_path(system: System, edges):
-    """Sum over the tree joints from ground to each body: (n_b, …) to (n_b + 1, …)."""
-    return constant_product(system.topology.path, edges)
-
-
-def over_subtree(system: System, bodies):
-    """Sum over each body and all that it carries: (n_b, …) to (n_b, …)."""
-    return constant_product(system.topology.path[:-1].T, bodies)
-
-
-def sum_by_body(system: System, motions):
-    """Sum what motions (n_m, 3) contribute for the body that each moves: (n_b, 3)."""
-    topology = system.topology
-    if np.array_equal(topology.moved_body, np.arange(topology.num_bodies)):
-        return motions
-    onto = np.arange(topology.num_bodies)[:, None] == topology.moved_body
-    return constant_product(onto, motions)
-
-
-def expand_to_motions(topology, speeds):
-    """What belongs to speeds (n_v, …), for the motions that they cause: (n_m, …)."""
-    return speeds if topology.motion_column is None else speeds[topology.motion_column]
-
-
-def sum_by_speed(topology, motions):
-    """Sum what belongs to motions (…, n_m) for the speed that causes each: (…, n_v)."""
-    if topology.motion_column is None:
-        return motions
-    onto = np.asarray(topology.motion_column)[:, None] == np.arange(topology.num_speeds)
-    return motions @ jnp.asarray(onto, motions.dtype)
-
-
 def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " n_v"]:
     """Generalised force of wrenches on bodies, (n_b, 3) each, the moment about the centre of mass."""
     system, topology = configuration.system, configuration.system.topology
@@ -227,11 +190,11 @@ def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
     topology, count = system.topology, system.topology.num_bodies
     parent, child = np.array(topology.parent), np.array(topology.child)
     reversed_ = topology.reversed[:, None]
-    turn, shift, angular_subspace, linear_subspace = _joint_motions(system, q)
+    turn, shift, angular_subspace, linear_subspace = joint_motions(system, q)
     relative = compose(compose(system.parent_axes[:count], turn), transpose(system.child_axes[:count]))
     if np.any(reversed_):
         relative = jnp.where(reversed_[:, :, None], transpose(relative), relative)
-    rotation = _along_path_product(topology, relative)
+    rotation = product_along_path(topology, relative)
     joint_axes = compose(rotation[parent], system.parent_axes)
     parent_arm = rotate(rotation[parent], system.parent_offset)
     child_arm = rotate(rotation[child], system.child_offset)
@@ -262,101 +225,3 @@ def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
         child_axes=compose(rotation[on_child], system.child_axes[cuts]),
         separation=around + (child_arm[cuts] - parent_arm[cuts]) + (anchor(on_child) - anchor(on_parent)),
     )
-
-
-def _joint_motions(system, q):
-    """What the joints of the tree do, in joint axes.
-
-    **Returns:** rotation of each, (n_b, 3, 3), and translation, (n_b, 3); of each motion its subspace, angular
-    and linear, (n_m, 3) each.
-    """
-    topology, order, turns = system.topology, [], []
-    angular = jnp.asarray(_constant_subspace(topology, "angular_subspace"), q.dtype)
-    linear = _linear_subspace(system)
-    shift = sum_by_body(system, linear * expand_to_motions(topology, coordinates_by_speed(topology, q))[:, None])
-    for kind in topology.joint_groups:
-        if isinstance(kind.motion, RelativeMotion):
-            continue
-        turn = jax.vmap(kind.motion.rotation)(q[kind.coordinates])
-        if kind.motion.angular_subspace_at is not None:
-            turned = jax.vmap(kind.motion.angular_subspace_at)(q[kind.coordinates])
-            angular = scatter_static(angular, _motions_of(topology, kind), turned)
-        turns.append(turn)
-        order += kind.bodies
-    for kind, (turn, away, *subspace) in over_bending(_bent, system, lambda kind: (q[kind.coordinates],)):
-        motions, count = _motions_of(topology, kind), kind.coordinates.shape[1]
-        angular, linear = (
-            scatter_static(whole, motions, part[:, :count])
-            for whole, part in zip((angular, linear), subspace, strict=True)
-        )
-        shift = scatter_static(shift, kind.bodies, away)
-        turns.append(turn)
-        order += kind.bodies
-    turn = turns[0] if len(turns) == 1 else jnp.concatenate(turns)[np.argsort(order)]
-    return turn, shift, angular, linear
-
-
-def over_bending(function, system, read):
-    """A function of a `Motion`, arrays (k,) and numbers, over all joints that have one, by kind; traced once for each.
-
-    `read`: the arrays of a kind, (n, k) each.
-    """
-    alike = {}
-    for kind, numbers in zip(system.topology.joint_groups, system.group_parameters, strict=True):
-        if numbers is not None:
-            alike.setdefault(kind.motion, []).append((kind, numbers))
-    for motion, members in alike.items():
-        most = max(kind.coordinates.shape[1] for kind, _ in members)
-        arrays = [
-            (*(jnp.pad(array, ((0, 0), (0, most - array.shape[1]))) for array in read(kind)), numbers)
-            for kind, numbers in members
-        ]
-        together = (array[0] if len(members) == 1 else jnp.concatenate(array) for array in zip(*arrays, strict=True))
-        found = jax.vmap(partial(function, motion))(*together)
-        first = 0
-        for kind, _ in members:
-            own = slice(first, first + len(kind.bodies))
-            yield kind, tuple(part[own] for part in found)
-            first = own.stop
-
-
-def _motions_of(topology, kind):
-    """Which of the topology's `motions` are those of a kind of joints."""
-    return np.flatnonzero(np.isin(topology.moved_body, kind.bodies))
-
-
-@whole_jacobian
-def _bent(motion, coordinates, numbers):
-    """Rotation and translation of a `Motion`, and its subspace, angular and linear, (n, 3) each."""
-    follow = lambda change: jax.jvp(lambda q: motion(q, numbers), (coordinates,), (change,))
-    at, changes = jax.vmap(follow, out_axes=(None, 0))(jnp.eye(len(coordinates), dtype=coordinates.dtype))
-    return at[:3, :3], at[:3, 3], turn_rate(changes[:, :3, :3], at[:3, :3]), changes[:, :3, 3]
-
-
-def _constant_subspace(topology, part):
-    """A part of the motion subspace of each motion, (n_m, 3), zero where it is no constant of the joint's type."""
-    columns = []
-    for body, kind in enumerate(topology.joint_types[: topology.num_bodies]):
-        bends = kind.motion is not None
-        columns += len(topology.columns(body)) * [(0.0, 0.0, 0.0)] if bends else getattr(kind, part)
-    return np.array(columns).reshape(-1, 3)
-
-
-def _linear_subspace(system):
-    """Linear motion subspace of each motion in joint axes, (n_m, 3), zero for joints that bend."""
-    topology = system.topology
-    subspace = jnp.asarray(_constant_subspace(topology, "linear_subspace"), system.dtype)
-    screws = np.array([kind.is_screw for kind in topology.joint_types[: topology.num_bodies]])[topology.moved_body]
-    if not np.any(screws):
-        return subspace
-    return jnp.where(screws[:, None], system.joint_parameter[topology.moved_body][:, None], 1.0) * subspace
-
-
-def _along_path_product(topology, relative):
-    """Products of relative rotations from ground to each body, in log2(depth) rounds."""
-    rotation = jnp.concatenate([relative, jnp.eye(3, dtype=relative.dtype)[None]])
-    carrier = np.array([*topology.predecessor, GROUND_INDEX])
-    while np.any(carrier != GROUND_INDEX):
-        rotation = compose(rotation[carrier], rotation)
-        carrier = carrier[carrier]
-    return rotation

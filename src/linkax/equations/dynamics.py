@@ -11,16 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import (
-    Configuration,
-    along_path,
-    along_speeds,
-    expand_to_motions,
-    over_subtree,
-    sum_by_body,
-    sum_by_speed,
-)
+from linkax.equations.configuration import Configuration, along_speeds
 from linkax.equations.motion import Motion
+from linkax.equations.tree_sums import along_path, expand_to_motions, over_subtree, sum_by_body, sum_by_speed
 from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose

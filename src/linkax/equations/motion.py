@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, along_path, expand_to_motions, over_bending, sum_by_body
+from linkax.equations.configuration import Configuration
+from linkax.equations.joint_motions import over_bending
 from linkax.equations.system import System
+from linkax.equations.tree_sums import along_path, expand_to_motions, sum_by_body
 from linkax.model.bodies import Frame
 from linkax.model.forces import Load
 from linkax.model.terms import Term

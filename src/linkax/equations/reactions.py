@@ -6,10 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from linkax.equations.configuration import Configuration, bodies_of_cuts, expand_to_motions, over_subtree, sum_by_body
+from linkax.equations.configuration import Configuration, bodies_of_cuts
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
-from linkax.equations.loops import RowVectors, combined_rows, immobile_rows, plain_rows, ropes, sorted_multipliers
+from linkax.equations.loop_rows import RowVectors, combined_rows, immobile_rows, plain_rows
+from linkax.equations.loops import ropes, sorted_multipliers
 from linkax.equations.motion import Motion
+from linkax.equations.tree_sums import expand_to_motions, over_subtree, sum_by_body
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross

@@ -11,24 +11,28 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import on_manifold, retract
 from linkax.equations.dynamics import generalised_force
 from linkax.equations.loops import gamma, is_driven, residual
 from linkax.equations.motion import move
+from linkax.equations.system import System
 from linkax.formulations.formulation import linear_system
 from linkax.formulations.singular_limit import Direction, Value, singular_limit
 from linkax.formulations.tangents import Tangents, state_tangent, unbalanced_tangent
 from linkax.linalg.block_elimination import BlockInverse
-from linkax.linalg.constrained_solve import SaddleInverse, least_multipliers
+from linkax.linalg.constrained_solve import SaddleInverse
+from linkax.linalg.least_multipliers import least_multipliers
 from linkax.linalg.while_falling import while_falling
 from linkax.spatial.vectors import largest
+from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import jit_inline
 
 ROUNDING_ULPS = 8.0
 MOST_CORRECTIONS = 20
+ALONG = (1e-4, 1e-3, 1e-2)  # radians or lengths of the mechanism, along which ranks of fronts show
 
 
 class Evaluated(NamedTuple):
@@ -123,6 +127,28 @@ def approach(method, system, t, q, v):
 
     begin = on_manifold(system.topology, q), v, jnp.ones((), q.dtype)
     return while_falling(improve, begin, MOST_CORRECTIONS, small, q.dtype)
+
+
+def ranks_along(method, system: System, t, q, v, rank) -> Int[Array, " k"]:
+    """The rank of J of each front along the motion from q with speeds v, of any size; without fronts of each island.
+
+    `rank`: of each island. Ranks of fronts show at states a little farther on; where they do not add up to it there,
+    a front has as many independent rows as the tolerance says.
+    """
+    plan = system.structure.elimination
+    if plan is None:
+        return rank
+    duration = ratio(1.0, system.fastest(v), 0.0)
+
+    def found(share):
+        later = t + share * duration if is_driven(system) else t
+        near = retract(system.topology, q, share * duration * v)
+        closed, _, _ = approach(method, system, later, near, v)
+        return method.split(linear_system(system, later, closed)).rank
+
+    ranks = jnp.max(lax.map(found, jnp.asarray(ALONG, q.dtype)), axis=0)
+    adds_up = jnp.all(system.structure.ranks_of_islands(ranks) == rank)
+    return jnp.where(adds_up, ranks, plan.most_independent)
 
 
 def limit_of_acceleration(method, system, t, q, v) -> Float[Array, " n_v"]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from linkax.equations.configuration import Configuration
 from linkax.equations.coordinates import on_manifold, retract
 from linkax.equations.dynamics import generalised_force
-from linkax.equations.loops import gamma, is_driven, rate, residual
+from linkax.equations.loops import gamma, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations import projected_state
@@ -35,11 +35,9 @@ from linkax.linalg.constrained_solve import (
 )
 from linkax.model.numbers import number, one_of, require, whole_number
 from linkax.spatial.vectors import largest
-from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import jit_inline
 
 Metric = Literal["mass", "identity"]
-ALONG = (1e-4, 1e-3, 1e-2)  # radians or lengths of the mechanism, along which ranks of fronts show
 
 
 class AtRest(NamedTuple):
@@ -296,24 +294,3 @@ class TangentSpace(AbstractFormulation):
         acceleration, _ = inverse.apply(generalised_force(motion), gamma(motion))
         at = ConstraintSplit(linear.configuration, linear.jacobian, split)
         return AtRest(at, linear.mass, acceleration, inverse.definiteness)
-
-    def ranks_along(self, system: System, t, q, v, rank) -> Int[Array, " k"]:
-        """`rank_nearby` along motion from here with speeds v, of any size, where `rank` is that of each island.
-
-        That of fronts shows at states a little farther on. Where it does not add up there, a front has as many
-        independent rows as the tolerance says.
-        """
-        plan = system.structure.elimination
-        if plan is None:
-            return rank
-        duration = ratio(1.0, system.fastest(v), 0.0)
-
-        def found(share):
-            later = t + share * duration if is_driven(system) else t
-            near = retract(system.topology, q, share * duration * v)
-            closed, _, _ = projected_state.approach(self, system, later, near, v)
-            return self.split(linear_system(system, later, closed)).rank
-
-        ranks = jnp.max(lax.map(found, jnp.asarray(ALONG, q.dtype)), axis=0)
-        adds_up = jnp.all(system.structure.ranks_of_islands(ranks) == rank)
-        return jnp.where(adds_up, ranks, plan.most_independent)

@@ -280,27 +280,3 @@ def constrained_solve(inverse, mass, jacobian, f, gamma, refinements: int = 1, p
     # One vector, not a pair: JAX transposes such a solve only where all of its right side is linear.
     unknowns = lax.custom_linear_solve(forwards, jnp.concatenate([f, gamma]), solve, transpose_solve)
     return unknowns[:n], unknowns[n:]
-
-
-class LeastMultipliers(NamedTuple):
-    """The smallest of the multipliers with one Jᵀλ, and what may be added to them.
-
-    - `multipliers`: (m,). `free`: orthonormal null space of Jᵀ, (m, m), zero columns where there is none.
-    """
-
-    multipliers: Float[Array, " m"]
-    free: Float[Array, "m m"]
-
-
-def least_multipliers(jacobian, multipliers, scales, tolerance, rank) -> LeastMultipliers:
-    """Of all multipliers with the same Jᵀλ those of minimum norm, differentiable like `constrained_solve`.
-
-    They solve λ = J y, Jᵀλ = given, a constrained solve too. `scales`, `tolerance`: see `invert`;
-    `rank`: of J.
-    """
-    transposed, size = (jacobian * scales).T, multipliers.shape[0]
-    one = jnp.ones(size, multipliers.dtype)
-    inverse = invert(None, transposed, one, tolerance, rank)
-    given = transposed @ multipliers
-    found, _ = constrained_solve(inverse, jnp.eye(size, dtype=given.dtype), transposed, 0.0 * one, given)
-    return LeastMultipliers(found, inverse.basis)

@@ -11,14 +11,7 @@ from linkax.simulation.explain.diagnosis import cause
 from linkax.simulation.explain.remarks import in_words
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
 from linkax.simulation.integrate.integrate import integrate_run
-from linkax.simulation.integrate.results import (
-    ENDED_WELL,
-    RESULTS,
-    WARNINGS,
-    SimulationError,
-    remark_name,
-    result_name,
-)
+from linkax.simulation.integrate.results import ENDED_WELL, RESULTS, WARNINGS, SimulationError, remark_name, result_name
 from linkax.simulation.integrate.run import DEFAULT_FORMULATION, DEFAULT_MAX_STEPS, Run
 from linkax.simulation.read.solution import Solution
 from linkax.simulation.start.state import State

@@ -7,7 +7,8 @@ import numpy as np
 
 from linkax.equations.configuration import configure
 from linkax.equations.dynamics import mass_matrix
-from linkax.equations.loops import gaps, jacobian, residual
+from linkax.equations.gaps import gaps
+from linkax.equations.loops import jacobian, residual
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.formulations.classical import ClassicalFormulation

@@ -15,7 +15,7 @@ from linkax.equations.reactions import Reaction, reactions, reactions_to, seen_f
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.linalg.constrained_solve import LeastMultipliers, least_multipliers
+from linkax.linalg.least_multipliers import LeastMultipliers, least_multipliers
 from linkax.spatial.rotations import rotate
 from linkax.spatial.vectors import cross, largest
 

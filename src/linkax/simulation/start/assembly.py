@@ -9,7 +9,7 @@ import numpy as np
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, on_manifold
-from linkax.equations.loops import Gap, gaps
+from linkax.equations.gaps import Gap, gaps
 from linkax.equations.system import system_of
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.model.mechanism import Mechanism

@@ -8,7 +8,8 @@ from jax import lax
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import rates, retract, speeds
-from linkax.equations.loops import as_if_closed, flips, jacobian, residual
+from linkax.equations.gaps import as_if_closed, flips
+from linkax.equations.loops import jacobian, residual
 from linkax.equations.system import System
 from linkax.linalg.while_falling import while_falling
 from linkax.model.terms import Term

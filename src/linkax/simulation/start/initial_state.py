@@ -9,9 +9,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from linkax.equations.configuration import configure
-from linkax.equations.loops import gaps
+from linkax.equations.gaps import gaps
 from linkax.equations.motion import move
 from linkax.equations.system import System
+from linkax.formulations.projected_state import ranks_along
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
@@ -88,7 +89,7 @@ def check_initial_state(method: TangentSpace, system: System, t, state: State) -
         t=begins,
         state=start,
         singular=jnp.any(rank > crossing.inverse.rank),
-        rank=method.ranks_along(system, t, q, direction, rank),
+        rank=ranks_along(method, system, t, q, direction, rank),
         definiteness=definiteness,
         assembled=assembled,
         finite=finite,

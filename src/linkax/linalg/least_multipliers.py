@@ -1,0 +1,32 @@
+"""Multipliers of minimum norm, where redundant rows leave a choice."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from linkax.linalg.constrained_solve import constrained_solve, invert
+
+
+class LeastMultipliers(NamedTuple):
+    """The smallest of the multipliers with one Jᵀλ, and what may be added to them.
+
+    - `multipliers`: (m,). `free`: orthonormal null space of Jᵀ, (m, m), zero columns where there is none.
+    """
+
+    multipliers: Float[Array, " m"]
+    free: Float[Array, "m m"]
+
+
+def least_multipliers(jacobian, multipliers, scales, tolerance, rank) -> LeastMultipliers:
+    """The multipliers of minimum norm with the same Jᵀλ, differentiable like `constrained_solve`.
+
+    They solve λ = J y, Jᵀλ = given, a constrained solve too. `scales`, `tolerance`: see `invert`;
+    `rank`: of J.
+    """
+    transposed, size = (jacobian * scales).T, multipliers.shape[0]
+    one = jnp.ones(size, multipliers.dtype)
+    inverse = invert(None, transposed, one, tolerance, rank)
+    given = transposed @ multipliers
+    found, _ = constrained_solve(inverse, jnp.eye(size, dtype=given.dtype), transposed, 0.0 * one, given)
+    return LeastMultipliers(found, inverse.basis)
