@@ -123,8 +123,8 @@ def row_gamma(motion: Motion, rows: RowVectors):
     """γ of rotation and translation rows: minus the terms of c̈ without v̇.
 
     A rotation row has c̈ = n·α + ṅ·ω with n = h₂ʲ × h₁ⁱ and ω, α the child's angular velocity and acceleration relative
-    to the parent; a translation row has ℓ c̈ = h₁ⁱ·(s̈ − 2 ω₁ × ṡ − α₁ × s + ω₁ × (ω₁ × s)), s̈ and ṡ in ground axes and
-    ω₁, α₁ of the parent.
+    to the parent; a translation row has ℓ c̈ = h₁ⁱ·(s̈ − 2 ω₁ × ṡ − α₁ × s + ω₁ × (ω₁ × s)), s̈ and ṡ in ground axes
+    and ω₁, α₁ of the parent.
     """
     configuration, topology = motion.configuration, motion.system.topology
     parent, child, joints = bodies_of_cuts(topology)

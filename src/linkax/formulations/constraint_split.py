@@ -23,9 +23,9 @@ OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
 
 
 class ConstraintSplit(eqx.Module):
-    """A configuration as a crossing of branches; of one branch alone where the rank of J is constant.
+    """J at a configuration and its split into normal and tangent space; where branches cross, what tells them apart.
 
-    - `jacobian`: J, (m, n_v), and `inverse`, its split of the space of speeds, in any metric.
+    - `jacobian`: J, (m, n_v), and `inverse`, its split, in any metric.
     """
 
     configuration: Configuration
@@ -34,7 +34,7 @@ class ConstraintSplit(eqx.Module):
 
     @staticmethod
     def at(system: System, t, q, rank_tolerance) -> "ConstraintSplit":
-        """At coordinates q."""
+        """Split at coordinates q, in the identity metric."""
         return ConstraintSplit.of(configure(system, t, q), rank_tolerance)
 
     @staticmethod
@@ -45,22 +45,22 @@ class ConstraintSplit(eqx.Module):
         return ConstraintSplit(configuration, rows, inverse)
 
     def _outside(self, rows):
-        """Rows of which the part that J reaches is taken off."""
+        """The part of rows outside the range of J: r − J G r."""
         return rows - self.jacobian @ (self.inverse.normal @ rows)
 
     def _bias(self, v):
         return velocity_gamma(move(self.configuration, v))
 
     def _basis_of_ones(self):
-        """The basis of the null space of J with each direction of size one, whatever the metric that it is in."""
+        """The basis of the null space of J, each direction of length one in scales."""
         basis = self.inverse.basis
         size = length(basis / self.configuration.system.scales[:, None], axis=0)
         return basis / jnp.where(size > 0.0, size, 1.0)
 
     def off_branch(self, v, scale=1.0) -> Float[Array, " m"]:
-        """The part of γ(v, v) outside the range of J: zero for speeds on a branch.
+        """The part of γ(v, v) outside the range of J, (m,): zero for speeds on a branch.
 
-        `scale`: what the speeds v are to be multiplied by; that of γ is then its square.
+        **Arguments:** `scale`: a factor of the speeds v, whose square is one of γ.
         """
         gamma, scales = self._bias(v) + self._driven(scale), self.configuration.system.scales
         # With derivatives, which the split has none of; J a is the same in any metric.
@@ -74,12 +74,14 @@ class ConstraintSplit(eqx.Module):
         return drive_acceleration(self.configuration.system, self.configuration.t) / scale**2
 
     def along(self, v, from_rest) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
-        """Along speeds v, of any size: how far they are from a branch, and the ranks of all islands next to here.
+        """How far speeds v, of any size, are from a branch, and the ranks of all islands beside this configuration
+        along v.
 
-        Where v are accelerations `from_rest`, what drives ask for is relative to them, and not to their square.
+        **Arguments:** `from_rest`: whether v are accelerations; what drives ask for is relative to them then, not their
+        square.
 
-        The first is `off_branch` of speeds of which the largest is one; the second, by first-order
-        perturbation, rank(J) + rank(Uᵀ J̇ N) with U, N the null spaces of Jᵀ and J.
+        **Returns:** `off_branch` for the largest speed one, (m,); by first-order perturbation
+        rank(J) + rank(Uᵀ J̇ N), U and N the null spaces of Jᵀ and J, (k,).
         """
         fastest = self.configuration.system.fastest(v)
         scale = jnp.where(fastest > 0.0, fastest, 1.0)

@@ -70,7 +70,8 @@ class AbstractFormulation(eqx.Module):
 
     @abc.abstractmethod
     def derivative(self, system: System, t, q, v, correct):
-        """Compute (v, v̇, q, d): speeds, accelerations, where they hold, and the distance from a singular configuration.
+        """Compute (v, v̇, q, d): speeds, accelerations, where they hold, and the distance from a singular
+        configuration.
 
         `correct`: put the state on the loops before the equations of motion are formed; False, or a bool array. d is
         one where the formulation does not measure it.

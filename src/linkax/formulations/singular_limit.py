@@ -1,9 +1,9 @@
 """Values at a state close to a singular configuration, as limits along the motion.
 
-At a distance d from a singular configuration rounding reaches accelerations multiplied by 1/d²,
-and what a state is off the loops is amplified by 1/d. Yet on a branch of the motion positions,
-speeds and accelerations are smooth functions through the passage. So close to it they are
-interpolated between states before and behind it, where nothing is amplified.
+At a distance d from a singular configuration rounding reaches accelerations multiplied by 1/d², and a gap of the loops
+by 1/d. Yet on a branch of the motion positions, speeds and accelerations are smooth through the passage. So close to it
+they are interpolated between states before and behind it, where nothing is amplified:
+f(0) ≈ Σ wₖ (f(kh) + f(−kh)), with Lagrange's weights w = (56, −28, 8, −1) / 70 for k = 1, …, 4.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ class Value(NamedTuple):
     """A function of the coordinates at one state.
 
     - `answers`: a tuple of arrays, first the coordinates on the loops.
-    - `distance`: from the nearest singular configuration.
+    - `distance`: d, from the nearest singular configuration.
     - `gap`: how far the loops were open before they were closed.
     """
 
@@ -57,7 +57,7 @@ class _Trip(NamedTuple):
 
 
 class Direction(NamedTuple):
-    """A state on its way: where a step of REACH along the motion begins.
+    """A state, and how to step from it along the motion.
 
     - `t` [s]; `q`, (n_q,); `v`, (n_v,). `fastest`: the largest speed, in radians and lengths
       of the mechanism.

@@ -1,4 +1,4 @@
-"""Many classical formulations in few compiled programs."""
+"""Many classical formulations in one program, by `lax.switch`."""
 
 import dataclasses
 
@@ -31,9 +31,9 @@ class _OneCorrection(AbstractCorrection):
 
 
 def in_one_program(formulations: list[ClassicalFormulation]) -> list[ClassicalFormulation]:
-    """The same formulations, such that those without correction share a compiled program, and those with one another.
+    """The same formulations, such that all without correction share one program, and all with one another.
 
-    Compiling takes seconds each, and the choice within a program a microsecond in each evaluation.
+    Compiling takes seconds each, the choice within a program a microsecond in each evaluation.
     """
     found = list(formulations)
     for corrected in (False, True):

@@ -1,10 +1,10 @@
-"""The constrained solve for a mechanism whose loops follow each other, in time proportional to their number.
+"""The constrained solve front by front, in time proportional to the number of loops that follow each other.
 
-What `linkax.linalg.constrained_solve.invert` does at once is done front by front (see `elimination_plan`). A front's
-own speeds, and what motions of the fronts before it still affect it, are split by a column-pivoted QR of its rows into
-a normal and a tangent space. The tangent space is turned, so that few directions affect the speeds which are passed on,
-and these go on to the next front; of the others the dynamics are solved. All turns are orthogonal in units of the
-speeds, so that nothing grows from front to front, and ranks are found at any singular configuration.
+It does what `linkax.linalg.constrained_solve.invert` does at once, in the order of an `elimination_plan`. A
+column-pivoted QR of a front's rows splits its speeds, and what motions of the fronts before still affect it, into a
+normal and a tangent space. The tangent space is turned so that few directions affect the speeds passed on; these go on
+to the next front, and of the others the dynamics are solved. All turns are orthogonal in scales, so that nothing grows
+from front to front, and ranks are found in any singular configuration.
 """
 
 from typing import NamedTuple
@@ -26,9 +26,10 @@ from linkax.xla.derivatives import ratio
 
 
 class Blocks(NamedTuple):
-    """What the fronts have of J and M: a front reads s kept speeds, and p that it adds, by m rows.
+    """The entries of J and M by front; a front reads s speeds of its separator and p of its interior, in m rows.
 
-    - `rows`: (k, m, s + p). `coupling`: M of kept and added speeds, (k, s, p). `own`: M of the added, (k, p, p).
+    - `rows`: J, (k, m, s + p). `coupling`: M between separator and interior, (k, s, p). `own`: M of the interior, (k,
+      p, p).
     """
 
     rows: Float[Array, "k m s+p"]
@@ -37,11 +38,11 @@ class Blocks(NamedTuple):
 
 
 class BlockInverse(eqx.Module):
-    """The inverse of [[M, -Jᵀ], [J, 0]] on the independent rows of J, as what each front passes on.
+    """The inverse of [[M, −Jᵀ], [J, 0]] on the independent rows of J, by what each front passes on.
 
-    Speeds, and forces along them, are in units. From front to front go, forwards, the load on the directions passed on
-    and the part of the kept speeds that is decided; backwards the motion along these directions and the force on the
-    kept speeds. Both are linear in what comes in and in a front's own f and γ.
+    Speeds, and forces along them, are in scales. Forwards go the load on the directions passed on and the part of the
+    separator's speeds that is decided; backwards the motion along these directions and the force on the separator's
+    speeds. Both are linear in what comes in and in the front's own f and γ.
 
     - `forwards`: (k, 2s, 2s + p + m). `backwards`: (k, 2s + p + m, 4s + p + m).
     - `last`: inverse of the metric of the directions after the last front, (s, s).
@@ -58,7 +59,7 @@ class BlockInverse(eqx.Module):
     definiteness: Float[Array, ""]
 
     def apply(self, f, gamma):
-        """(a, λ) for the system that was inverted."""
+        """Solve for (a, λ)."""
         plan, kept = self.plan, self.last.shape[0]
         added = plan.interior_table.shape[1]
         own = jnp.concatenate([_read(self.scales * f, plan.interior_table), _read(gamma, plan.row_table)], axis=1)
@@ -84,7 +85,7 @@ class BlockInverse(eqx.Module):
 
 
 def invert_by_blocks(blocks: Blocks, scales, tolerance, plan: EliminationPlan, rank_nearby=None) -> BlockInverse:
-    """Like `linkax.linalg.constrained_solve.invert`, front by front; `rank_nearby` of each front, (k,)."""
+    """Invert like `linkax.linalg.constrained_solve.invert`, front by front; `rank_nearby` of each front, (k,)."""
     blocks, scales = lax.stop_gradient((blocks, scales))
     kept_unit, added_unit = (_read(scales, table) for table in (plan.separator_table, plan.interior_table))
     absent = jnp.asarray(plan.interior_table < 0, scales.dtype)
@@ -112,7 +113,7 @@ def invert_by_blocks(blocks: Blocks, scales, tolerance, plan: EliminationPlan, r
 
 
 def in_fronts(plan: EliminationPlan, weight: StaticSparse, jacobian: StaticSparse) -> Blocks:
-    """The entries of M and J that the fronts read."""
+    """Read the entries of M and J of each front."""
     kept, added = plan.separator_table, plan.interior_table
     return Blocks(
         rows=_blocks(jacobian, plan.row_table, plan.table),
@@ -122,13 +123,13 @@ def in_fronts(plan: EliminationPlan, weight: StaticSparse, jacobian: StaticSpars
 
 
 def with_identity_metric(blocks: Blocks, plan: EliminationPlan, scales) -> Blocks:
-    """The same rows, and instead of M the metric that measures speeds by their units."""
+    """Replace M by the identity metric, which measures speeds in their scales."""
     own = jax.vmap(jnp.diag)(jnp.where(plan.interior_table < 0, 0.0, _read(scales, plan.interior_table) ** -2))
     return Blocks(blocks.rows, jnp.zeros_like(blocks.coupling), own)
 
 
 class SaddlePointInFronts(eqx.Module):
-    """[[M, -Jᵀ], [J, 0]], to be multiplied with (a, λ) in one vector, (n,) and (m,) of `sizes`."""
+    """The matrix [[M, −Jᵀ], [J, 0]], as a function of (a, λ) in one vector, (n,) and (m,) of `sizes`."""
 
     blocks: Blocks
     plan: EliminationPlan = eqx.field(static=True)
@@ -146,7 +147,7 @@ class SaddlePointInFronts(eqx.Module):
 
 
 class _Passed(NamedTuple):
-    """What a front passes on: the kept speeds along each direction, (s, s), their metric, and its size without loss."""
+    """What a front passes on: separator speeds along each direction, (s, s), their metric, its size without loss."""
 
     along: Float[Array, "s s"]
     metric: Float[Array, "s s"]
@@ -162,7 +163,7 @@ class _Eliminated(NamedTuple):
 
 
 class _Here(NamedTuple):
-    """The number of kept speeds, the length of the longest row, and how independent rows are told."""
+    """The number of separator speeds, the length of the longest row, and how independent rows are told."""
 
     kept: int
     size: Float[Array, ""]
@@ -170,7 +171,7 @@ class _Here(NamedTuple):
     is_known: bool
 
     def eliminate(self, passed: _Passed, front):
-        """One front: y are the directions passed on and the added speeds."""
+        """Eliminate one front: y are the directions passed on and the interior speeds."""
         blocks, onward, rank = front
         kept, (rows, width) = self.kept, blocks.rows.shape
         added, count, dtype = width - kept, min(rows, width), blocks.rows.dtype
@@ -242,13 +243,13 @@ def _times(matrices, vectors):
 
 
 def _definite(metric, size):
-    """L⁻¹ of a metric L Lᵀ, and the smallest of the squared diagonal of L relative to what no loss would leave."""
+    """L⁻¹ of a metric L Lᵀ, and the smallest of L's squared diagonal over what no loss would leave."""
     root, diagonal = cholesky_inverse(metric)
     return root, jnp.min(ratio(diagonal**2, size, 0.0), initial=1.0)
 
 
 def _read(values, table):
-    """Values (n,) at the places of a table, zero where it is filled up."""
+    """Read values (n,) at the indices of a table, zero at −1."""
     return jnp.concatenate([values, jnp.zeros(1, values.dtype)])[table]  # -1 and beyond the end
 
 
@@ -258,7 +259,7 @@ def _blocks(matrix, down, across):
 
 
 def _gathered(found, table, size):
-    """Values of fronts (k, p) in the order of what a table names; zero for what it does not name."""
+    """Put values of fronts, (k, p), in the order of a table's indices; zero for what it does not name."""
     source = np.full(size, table.size)
     source[table[table >= 0]] = np.flatnonzero(table.ravel() >= 0)
     return _read(found.reshape(-1), source)

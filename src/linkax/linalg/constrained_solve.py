@@ -1,9 +1,9 @@
 """The constrained solve M a = f + Jᵀλ, J a = γ, for any rank of J, and its derivative.
 
-A column-pivoted QR of the metric-weighted Jacobian's transpose splits the space of speeds into a
-normal space, which the constraints decide, and a tangent space, which the dynamics decide. From
-it follow the four blocks of the saddle-point system's inverse, a = T f + G γ, λ = S γ − Gᵀ f,
-which serve accelerations and corrections alike.
+A column-pivoted QR of the metric-weighted Jacobian, A P = Q R with A = L⁻¹Jᵀ and W = L Lᵀ, splits the space of speeds
+into a normal space, which the constraints decide, and a tangent space, which the dynamics decide. From it follow the
+four blocks of the saddle-point system's inverse, a = T f + G γ, λ = S γ − Gᵀ f, for accelerations and corrections
+alike.
 """
 
 from typing import NamedTuple
@@ -24,16 +24,20 @@ from linkax.xla.tracing import jit_inline
 
 
 class SaddleInverse(NamedTuple):
-    """The inverse of [[W, -Jᵀ], [J, 0]] on the independent rows of J.
+    """The inverse of [[W, −Jᵀ], [J, 0]] on the r independent rows of J: a = T f + G γ, λ = S γ − Gᵀ f.
 
-    - `tangent` T (n, n), `normal` G (n, m), `compliance` S (m, m).
-    - `basis`: tangent space, (n, n), zero columns where the normal space is.
-    - `rank`: number of independent rows.
-    - `distance` d: |R_rr| / |R₁₁|, r the rank here or that of the neighbourhood where it is
-      known; falls to zero in a singular configuration. One without rows.
-    - `definiteness`: of W: the smallest of the squared diagonal of its Cholesky factor over its own
-      diagonal, or over the rounding of the largest where that is more; rounding or not a number where
-      the mass matrix is singular on the tangent space.
+    With B = L⁻ᵀ and Pᵣ the first r columns of P:
+
+    - `tangent` T = (B Q₂)(B Q₂)ᵀ, (n, n); in another mass matrix M than W, B Q₂ ((B Q₂)ᵀ M B Q₂)⁻¹ (B Q₂)ᵀ, see
+      `with_mass`.
+    - `normal` G = B Q₁ R₁₁⁻ᵀ Pᵣᵀ, (n, m): a right inverse of J. `compliance` S = Pᵣ R₁₁⁻¹ R₁₁⁻ᵀ Pᵣᵀ − D, (m, m).
+    - `basis` B Q₂: tangent space, (n, n), zero columns where the normal space is.
+    - `rank` r: number of independent rows.
+    - `distance` d = |R_rr| / |R₁₁|, r the rank here or that of the neighbourhood where it is known; falls to zero in a
+      singular configuration. One without rows.
+    - `definiteness`: of W: the smallest of the squared diagonal of its Cholesky factor over its own diagonal, or over
+      the rounding of the largest where that is more; rounding or not a number where the mass matrix is singular on the
+      tangent space.
     """
 
     tangent: Float[Array, "n n"]
@@ -45,13 +49,13 @@ class SaddleInverse(NamedTuple):
     definiteness: Float[Array, ""]
 
     def apply(self, f, gamma):
-        """(a, λ) for the system that was inverted."""
+        """Solve for (a, λ)."""
         a = self.tangent @ f + self.normal @ gamma
         return a, self.compliance @ gamma - self.normal.T @ f
 
 
 class SaddlePoint(eqx.Module):
-    """[[M, -Jᵀ], [J, 0]], to be multiplied with (a, λ) in one vector."""
+    """The matrix [[M, −Jᵀ], [J, 0]], as a function of (a, λ) in one vector."""
 
     mass: Float[Array, "n n"]
     jacobian: Float[Array, "m n"]
@@ -68,7 +72,7 @@ def invert(weight, jacobian, scales, tolerance, rank_nearby=None) -> SaddleInver
     **Arguments:**
 
     - `weight`: M for the mass metric, positive definite on the tangent space, (n, n); or None
-      for the identity metric, which measures speeds by their units.
+      for the identity metric, which measures speeds in their scales.
     - `jacobian`: J, (m, n), of any rank, redundant and zero rows included.
     - `scales`: one unit of each speed, (n,), so that radians and metres compare.
     - `tolerance`: τ; a row is independent where |R_kk| > τ max(|R₁₁|, 1).
@@ -115,7 +119,7 @@ def invert(weight, jacobian, scales, tolerance, rank_nearby=None) -> SaddleInver
 
 
 def _metric(weight, jacobian, scales, tolerance):
-    """W = M + JᵀDJ in units, positive definite where M is so on the tangent space only, and the diagonal of D."""
+    """W = M + JᵀDJ in scales, positive definite where M is so on the tangent space only, and the diagonal of D."""
     weight, size = weight * scales[:, None] * scales[None, :], length(jacobian)
     # A row of rounding alone would add as much as any other, and is left out.
     square = jnp.where(size > tolerance * jnp.maximum(jnp.max(size, initial=0.0), 1.0), size**4, 0.0)
@@ -127,16 +131,16 @@ def _metric(weight, jacobian, scales, tolerance):
 
 
 def _scaled(to_metric, jacobian):
-    """Rows of J as columns in the metric, each as long as it is in units, and by how much it was scaled."""
+    """A = L⁻¹Jᵀ with columns rescaled to the norms of J's rows, and the factors of that."""
     weighted = to_metric @ jacobian.T
     scale = ratio(length(jacobian), length(weighted, axis=0), 1.0)
     return weighted * scale, scale
 
 
 def independent(r, tolerance, rank_nearby, largest=None):
-    """Which rows count as independent, of those chosen in order, and the distance d.
+    """Find the independent rows among the pivots of R, and the distance d.
 
-    `largest`: |R₁₁| of the whole, where `r` is that of a part.
+    **Arguments:** `largest`: |R₁₁| of the whole, where `r` is that of a part.
     """
     diagonal = jnp.abs(jnp.diagonal(r))
     largest = diagonal[0] if largest is None else largest
@@ -150,7 +154,7 @@ def independent(r, tolerance, rank_nearby, largest=None):
 
 
 def singularity_distance(weight, jacobian, scales, tolerance, islands, rank_nearby=None) -> Float[Array, ""]:
-    """`Inverse.distance` of `invert_apart`, with derivatives, where the pivots stay the same; none where it is zero."""
+    """`SaddleInverse.distance` of `invert_apart`, with derivatives as long as the pivots stay; none where d is zero."""
     each = _over_islands(_distance, weight, jacobian, scales, tolerance, islands, rank_nearby)
     return jnp.min(jnp.concatenate([jnp.ones(1, jacobian.dtype), *(found for *_, found in each)]))
 
@@ -168,7 +172,7 @@ def _distance(weight, jacobian, scales, tolerance, rank_nearby):
     columns = weighted[:, order[: len(active)]]
 
     def orthogonalise(k, carry):
-        """Column k, of length |R_kk|, taken off those after it."""
+        """Take column k, of length |R_kk|, off those after it."""
         columns, sizes = carry
         size = jnp.where(active[k], length(jnp.where(active[k], columns[:, k], 1.0), axis=0), 1.0)
         along = jnp.where(active[k], columns[:, k] / size, 0.0)
@@ -181,10 +185,10 @@ def _distance(weight, jacobian, scales, tolerance, rank_nearby):
 
 
 def invert_apart(weight, jacobian, scales, tolerance, islands, rank_nearby=None) -> SaddleInverse:
-    """Like `invert`, for a system that falls apart: each island (rows, columns) by itself.
+    """Invert each island (rows, columns) of a system that falls apart by itself, like `invert`.
 
-    Islands of one shape are inverted together, in one batch. `rank_nearby` is given, and `rank`
-    returned, for each island, (k,); `distance` and `definiteness` are the smallest.
+    Islands of one shape are inverted in one batch. `rank_nearby` is given, and `rank` returned, for each island, (k,);
+    `distance` and `definiteness` are the smallest.
     """
     (m, n), dtype = jacobian.shape, jacobian.dtype
     if len(islands) == 1:
@@ -207,7 +211,10 @@ def invert_apart(weight, jacobian, scales, tolerance, islands, rank_nearby=None)
 
 
 def _over_islands(function, weight, jacobian, scales, tolerance, islands, rank_nearby):
-    """A function of each island, of those of one shape together: their places, rows and columns, and what it gives."""
+    """Map a function over islands, those of one shape in a batch.
+
+    **Yields:** indices, rows and columns of such islands, and what the function gives.
+    """
     groups = {}
     for index, (rows, columns) in enumerate(islands):
         groups.setdefault((len(rows), len(columns)), []).append((index, rows, columns))
@@ -222,7 +229,7 @@ def _over_islands(function, weight, jacobian, scales, tolerance, islands, rank_n
 
 
 def with_mass(inverse: SaddleInverse, mass) -> SaddleInverse:
-    """The inverse for another mass matrix on the same split: M needs to be definite on T alone."""
+    """Replace W by a mass matrix M on the same split; M needs to be definite on the tangent space alone."""
     mass = lax.stop_gradient(mass)
     basis = inverse.basis
     projected, is_empty = basis.T @ mass @ basis, jnp.sum(basis**2, axis=0) == 0.0
@@ -237,7 +244,7 @@ def with_mass(inverse: SaddleInverse, mass) -> SaddleInverse:
 
 
 def _lower_inverse(matrix):
-    """L⁻¹ of a positive definite matrix L Lᵀ, and its definiteness (see `Inverse`)."""
+    """L⁻¹ of a positive definite matrix L Lᵀ, and its definiteness (see `SaddleInverse`)."""
     inverse, diagonal = cholesky_inverse(matrix)
     own = jnp.diagonal(matrix)
     # A point mass that turns about itself has an inertia of rounding squared.
@@ -249,11 +256,12 @@ def _lower_inverse(matrix):
 def constrained_solve(inverse, mass, jacobian, f, gamma, refinements: int = 1, product=None):
     """Solve M a = f + Jᵀλ, J a = γ, differentiably in M, J, f and γ, in both modes, to any order.
 
-    `inverse` is that of a system nearby, or of this one; each step of iterative refinement
-    multiplies the error by the distance between the two. Derivatives are solves of the same
-    system with the right-hand sides df − dM a + dJᵀλ and dγ − dJ a; nothing is differentiated
-    through the pivoting. They hold where the rank of J does not change. `product`: with the system's matrix, where
-    there is a quicker one than `SaddlePoint`.
+    Derivatives are solves of the same system with right-hand sides df − dM a + dJᵀλ and dγ − dJ a; nothing is
+    differentiated through the pivoting. They hold where the rank of J does not change.
+
+    **Arguments:** `inverse`: of this system or one nearby; each of `refinements` steps of iterative refinement
+    multiplies the error by the distance between the two; `product`: multiplies with the system's matrix, where there is
+    a quicker way than `SaddlePoint`.
 
     **Returns:** a, (n,), and λ, (m,); with dependent rows a and Jᵀλ are unique, λ is one of many.
     """

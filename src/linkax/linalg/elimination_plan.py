@@ -1,8 +1,8 @@
-"""A plan of elimination for a mechanism whose loops follow each other: front by front.
+"""The order of elimination for loops that follow each other: fronts, as in multifrontal methods.
 
 Speeds that one loop row reads, or that one inertia couples, belong together. Where such sets overlap only with their
-neighbours, they are put in a row of fronts: each adds some speeds and rows to what went before, and keeps of that only
-the speeds which later fronts still read. Names and indices only.
+neighbours, they make a row of fronts. Each adds interior speeds and rows to what went before, and keeps of that the
+separator, the speeds that later fronts still read. Names and indices only.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ class EliminationPlan:
 
     @property
     def work(self) -> float:
-        """Products of numbers that a factorisation takes, all fronts as large as the largest."""
+        """Multiplications of a factorisation, all fronts as large as the largest."""
         kept, added, rows = (len(table[0]) for table in (self.separator_table, self.interior_table, self.row_table))
         width = kept + added
         return len(self.interior) * (PER_FRONT + width**2 * (3 * width + 2 * rows) + 2 * width * (2 * width + rows))
@@ -51,12 +51,12 @@ class EliminationPlan:
 
     @property
     def most_independent(self) -> np.ndarray:
-        """The largest rank that each front can have, (k,)."""
+        """The largest rank of each front, (k,)."""
         return np.array([min(len(rows), len(front)) for rows, front in zip(self.rows, self.table, strict=True)])
 
     @cached_property
     def table(self) -> np.ndarray:
-        """The speeds that each front reads: kept, then added, (k, s + p)."""
+        """The speeds that each front reads: separator, then interior, (k, s + p)."""
         return np.concatenate([self.separator_table, self.interior_table], axis=1)
 
     @cached_property
@@ -73,9 +73,10 @@ def _filled(sets):
 
 
 def plan_elimination(of_rows, coupled, size: int) -> EliminationPlan:
-    """The fronts of loop rows and inertias.
+    """Find the fronts of loop rows and inertias.
 
-    - `of_rows`: the speeds that each row reads. `coupled`: sets of speeds that inertia couples. `size`: of v.
+    **Arguments:** `of_rows`: the speeds that each row reads; `coupled`: sets of speeds that inertia couples; `size`: of
+    v.
     """
     sets = _largest([frozenset(map(int, members)) for members in [*of_rows, *coupled]], size)
     levels = _levels(sets, size)
@@ -96,7 +97,7 @@ def plan_elimination(of_rows, coupled, size: int) -> EliminationPlan:
 
 
 def _evened(fronts):
-    """The same fronts, of which those that add more than others do so in two, where no more speeds are kept for that.
+    """Split fronts that add more speeds than usual in two, where the separator does not grow for that.
 
     All fronts take as long as the largest.
     """
@@ -114,7 +115,7 @@ def _evened(fronts):
 
 
 def _largest(sets, size):
-    """The sets that are part of no other."""
+    """The sets that are subsets of no other."""
     containing, found = [set() for _ in range(size)], []
     for members in sorted(set(sets), key=len, reverse=True):
         if not members or not set.intersection(*(containing[speed] for speed in members)):
@@ -125,7 +126,7 @@ def _largest(sets, size):
 
 
 def _levels(sets, size):
-    """How many sets lie between each speed and an end of its part of the mechanism, (n,); parts one after the other."""
+    """The number of sets between each speed and an end of its part, (n,); parts one after the other."""
     members = np.array([(index, speed) for index, together in enumerate(sets) for speed in together]).reshape(-1, 2)
     incidence = csr_array((np.ones(len(members)), members.T), shape=(len(sets), size))
     graph, levels = (incidence.T @ incidence).tocsr(), np.zeros(size, dtype=int)

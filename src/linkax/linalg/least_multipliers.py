@@ -9,9 +9,10 @@ from linkax.linalg.constrained_solve import constrained_solve, invert
 
 
 class LeastMultipliers(NamedTuple):
-    """The smallest of the multipliers with one Jᵀλ, and what may be added to them.
+    """Multipliers of minimum norm, and the null space of Jᵀ.
 
-    - `multipliers`: (m,). `free`: orthonormal null space of Jᵀ, (m, m), zero columns where there is none.
+    - `multipliers`: λ, (m,). `free`: orthonormal columns μ with Jᵀμ = 0, which may be added to λ, (m, m), else zero
+      columns.
     """
 
     multipliers: Float[Array, " m"]

@@ -7,7 +7,10 @@ SQUARINGS = 10
 
 
 def spectral_radius(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch"]:
-    """ρ = lim ‖Aᴺ‖^(1/N) (Gelfand), with N = 2¹⁰: too large by thousandths, for a nearly defective A by hundredths."""
+    """ρ = lim ‖Aᴺ‖^(1/N) (Gelfand), with N = 2¹⁰.
+
+    Too large by thousandths, for a nearly defective A by hundredths.
+    """
     logarithm, weight = jnp.zeros(matrix.shape[:-2], matrix.dtype), 1.0
     for _ in range(SQUARINGS):
         size, matrix = _scaled(matrix)

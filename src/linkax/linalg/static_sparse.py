@@ -1,8 +1,7 @@
-"""Products with matrices of which most entries are known to be zero when a program is compiled.
+"""Products with matrices whose zeros are known when a program is compiled.
 
-What connects the bodies of a large mechanism concerns few of them at a time. Each product is computed by reading the
-entries that it needs, where these are few, and as a product of full matrices where they are not. What is read XLA
-computes anew for each entry that reads it, so that one such product must not follow another.
+In a large mechanism each body concerns few others. Where few entries are needed, they are read one by one; else the
+matrices are multiplied. XLA computes an entry anew wherever it is read, so one such product must not follow another.
 """
 
 from typing import NamedTuple
@@ -16,7 +15,7 @@ LARGE = 256  # entries of a full matrix that are not worth it
 
 
 def constant_product(matrix: np.ndarray, values):
-    """A constant matrix (k, n) times `values` (n, …): (k, …)."""
+    """Multiply a constant matrix (k, n) with `values` (n, …): (k, …)."""
     flat = values.reshape(len(values), -1)
     width = int(np.max(np.count_nonzero(matrix, axis=1), initial=0))
     if not _is_worth_it(len(matrix) * width, matrix.size):
@@ -30,9 +29,9 @@ def constant_product(matrix: np.ndarray, values):
 
 
 class StaticSparse(NamedTuple):
-    """A matrix by its entries that can be other than zero.
+    """A matrix by its entries that may differ from zero.
 
-    - `values`: (k,). `places`: for each entry of the matrix 1 + its place among the values, or 0 where it is zero.
+    - `values`: (k,). `places`: for each entry of the matrix 1 + its index in `values`, 0 for a zero.
     """
 
     values: Float[Array, " k"]
@@ -40,28 +39,28 @@ class StaticSparse(NamedTuple):
 
     @staticmethod
     def whole(matrix) -> "StaticSparse":
-        """A matrix of which all entries can be other than zero."""
+        """Take all entries of a matrix."""
         return StaticSparse(jnp.ravel(matrix), 1 + np.arange(matrix.size).reshape(matrix.shape))
 
     @staticmethod
     def stacked(parts: "list[StaticSparse]") -> "StaticSparse":
-        """Rows of several, in order."""
+        """Stack the rows of several matrices."""
         first = np.cumsum([0, *(len(part.values) for part in parts)])
         places = [part.places + start * (part.places > 0) for part, start in zip(parts, first, strict=False)]
         return StaticSparse(jnp.concatenate([part.values for part in parts]), np.concatenate(places))
 
     def at(self, down, across):
-        """Entries, as NumPy reads them."""
+        """Read entries, indexed as in NumPy."""
         nothing = jnp.zeros(1, self.values.dtype)
         return jnp.concatenate([nothing, self.values])[self.places[down, across]]
 
     def dense(self):
-        """All entries."""
+        """Read all entries."""
         return self.at(slice(None), slice(None))
 
 
 def products_of_pairs(left: np.ndarray, right: np.ndarray, a, b) -> StaticSparse:
-    """The matrix of a_i · b_j, vectors (k, d) and (n, d), with i in `left` and j in `right`; zero where i is -1."""
+    """The matrix of aᵢ · bⱼ, vectors (k, d) and (n, d), i in `left` and j in `right`; zero where i is −1."""
     present = left >= 0
     pairs, source = np.unique((left * len(b) + right)[present], return_inverse=True)
     places = np.zeros(left.shape, dtype=int)
@@ -78,7 +77,7 @@ def _is_worth_it(read, entries):
 
 
 def assembled(shape, parts, dtype):
-    """An array of zeros but for parts: (indices, values), the indices those of NumPy, one array for each axis."""
+    """Make an array of parts (indices, values), zero elsewhere; indices as in NumPy, one array for each axis."""
     source = np.zeros(shape, dtype=int)
     first = 1
     for indices, values in parts:

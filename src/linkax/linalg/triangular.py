@@ -1,6 +1,6 @@
-"""Inverses of triangular factors, for one matrix by LAPACK, for batches of small ones in compiled loops.
+"""Inverses of triangular factors: of one matrix by LAPACK, in batches of small ones by compiled loops.
 
-A batch of small matrices spends its time in calling LAPACK. Larger ones are given to it one by one.
+A batch of small matrices would spend its time in calling LAPACK. Larger ones go to it one by one.
 """
 
 import jax.numpy as jnp

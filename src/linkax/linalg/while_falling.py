@@ -7,10 +7,10 @@ from jax import lax
 
 
 def while_falling(improve: Callable, begin, most: int, small, dtype):
-    """Iterate until what is missed is small, stops falling, or `most` iterations are done; once at least.
+    """Iterate until the residual is small, stops falling, or `most` iterations are done; at least once.
 
-    **Arguments:** `improve`: (state, what the iteration before missed, infinite at first) ↦ (state, what is missed);
-    `begin`: the first state; `dtype`: floating-point type of what is missed.
+    **Arguments:** `improve`: (state, residual of the iteration before, infinite at first) ↦ (state, residual); `begin`:
+    the first state; `dtype`: floating-point type of the residual.
 
     **Returns:** the last state.
     """

@@ -1,4 +1,4 @@
-"""Functions that are computed in another way in a batch: JAX's own rules cost too much there, or hang."""
+"""Functions with another way of computing in a batch, where JAX's own rules cost too much or hang."""
 
 import math
 
@@ -10,7 +10,7 @@ SMALL = 32  # rows, up to which elimination serves batches
 
 
 def one_by_one(function):
-    """A function of pytrees that calls LAPACK, for one member of a batch after another on a CPU.
+    """Map a function that calls LAPACK over the members of a batch one after another, on a CPU.
 
     jaxlib (0.10) spreads a LAPACK call for a batch over the threads that the program itself runs in, and waits for
     them: two such calls at once wait for each other for ever. Derivatives are those of the function as it is.
@@ -34,7 +34,7 @@ def one_by_one(function):
 
 
 def small_in_batches(single, batched):
-    """A function of a matrix, computed in another way in batches of small ones."""
+    """Compute a function of a matrix by `batched` in batches of small matrices, by `single` elsewhere."""
 
     @jax.custom_batching.custom_vmap
     def function(matrix):

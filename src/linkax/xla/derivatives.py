@@ -14,21 +14,22 @@ def ratio(a, b, otherwise):
 
 
 def materialise(primal, change):
-    """A change as an array: of zeros, where None stands for none."""
+    """Return a tangent as an array; None, the tangent of what does not change, as zeros."""
     return jnp.zeros_like(primal) if change is None else change
 
 
 def pushforward(function, primals, changes):
-    """Value and change of a function, like `equinox.filter_jvp`, which gives None for no change; this gives zeros."""
+    """Compute a function and its JVP, like `equinox.filter_jvp`, but with zeros where that gives None."""
     found, change = eqx.filter_jvp(function, primals, changes)
     numbers, _ = eqx.partition(found, eqx.is_inexact_array)
     return found, jax.tree.map(materialise, numbers, change)
 
 
 def whole_jacobian(function):
-    """A function (static, *arrays) of few numbers each whose derivative is found once, for all directions.
+    """Decorate a function (static, *arrays) of few numbers: compute its Jacobian once, and contract it with each
+    tangent.
 
-    A Jacobian by many directions, of which few concern this function, then costs no more than its own.
+    Of a Jacobian with many columns, few of which concern this function, it then costs no more than its own.
     """
 
     @partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -1,13 +1,11 @@
 """Flags and options of XLA, the compiler behind JAX.
 
-XLA makes a kernel of each operation that it cannot fuse with others, and on a CPU it takes some 50 ns to start one:
-longer than it runs, where a mechanism is small. A loop on few numbers XLA compiles into one kernel instead, unless it
-calls a library, as for products of matrices (see `linkax.xla.products_as_sums`). What is few is set by a flag
-that it reads once in a process, when JAX makes its first array. XLA ends the process for a flag that it does not know,
-so this one is an option among others in a list that it does not check. Another, that leaves fewer products to a library
-in batches, is given to versions that are known to know it.
-
-What a version of XLA does is tried, as versions tell too little.
+XLA makes a kernel of each operation that it cannot fuse with others. On a CPU it takes some 50 ns to start one, longer
+than it runs, where a mechanism is small. A loop over few numbers becomes one kernel, unless it calls a library, as for
+products of matrices (see `linkax.xla.products_as_sums`). A flag says how many are few. XLA reads it once in a process,
+when JAX makes its first array, and ends the process for a flag that it does not know; so this one is an extra option,
+in a list that XLA does not check. A second flag leaves fewer products to a library in batches; only versions that are
+known to know it get it. Versions tell too little of what XLA does, so it is tried.
 
 Most of the time to compile goes into optimisations, which a program that runs once does not earn back.
 """
@@ -34,7 +32,7 @@ QUICK = {  # to compile, not to run
 
 
 def set_flags():
-    """Add to `XLA_FLAGS` what it does not name yet."""
+    """Add to the environment's `XLA_FLAGS` the flags that it does not name yet."""
     given, flags = os.environ.get("XLA_FLAGS", ""), [LOOPS]
     if jaxlib.__version__.startswith(KNOWN_VERSIONS):
         flags.append(PRODUCTS)
@@ -44,7 +42,7 @@ def set_flags():
 
 @cache
 def quickest_to_compile() -> dict:
-    """Options of `jax.jit`, as far as XLA knows them: half of the time to compile and less, for a slower program."""
+    """Options of `jax.jit`, as far as XLA knows them: less than half of the time to compile, a slower program."""
     return {name: value for name, value in QUICK.items() if _is_known({name: value})}
 
 
@@ -60,8 +58,8 @@ def _is_known(options) -> bool:
 def makes_kernels_of_loops() -> bool:
     """Whether XLA makes one kernel of a loop like those of `linkax.xla.one_kernel.in_one_kernel`.
 
-    It does not where JAX had made an array before linkax was imported, where `XLA_FLAGS` say otherwise, and
-    in versions that know no such kernels. Warns, unless `XLA_FLAGS` ask for it, where runs on a CPU are slow for that.
+    It does not where JAX had made an array before linkax was imported, where `XLA_FLAGS` say otherwise, and in versions
+    without such kernels. Warns where runs on a CPU are slow for that, unless `XLA_FLAGS` ask for it.
     """
     with jax.ensure_compile_time_eval():
         step = lambda carry: (carry[0] + 1, jnp.sin(jnp.sum(carry[1][:, :, None] * carry[1], axis=1)))

@@ -16,12 +16,12 @@ MAPS, LIMIT_OF_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count"
 
 
 def watch_memory_maps():
-    """Make room before any program of this process is compiled."""
+    """Have `make_room` called before each compilation in this process."""
     jax.monitoring.register_scalar_listener(make_room)
 
 
 def make_room(event, *_time, **_what):
-    """Forget compiled programs where memory maps may not suffice for another one.
+    """Clear JAX's caches where too few memory maps are left for another program.
 
     **Raises:** `RuntimeError` where other things hold the maps. XLA would end the process.
     """
@@ -46,7 +46,7 @@ def make_room(event, *_time, **_what):
 
 
 def _has_room() -> bool:
-    """Whether memory maps suffice for another program; true where nothing tells."""
+    """Whether enough memory maps are left for another program; true where the system does not tell."""
     try:
         limit = _limit_of_maps()
         return limit - _maps() >= min(ROOM, limit // 4)

@@ -13,15 +13,15 @@ from linkax.xla.tracing import jit_inline
 
 
 def in_one_kernel(when, sound):
-    """Decorate a function: where `when(*args)`, compute it as one kernel of the CPU, if that can be.
+    """Decorate a function: where `when(*args)`, compute it as one kernel of the CPU, if XLA makes such kernels.
 
-    Of a program on the CPU XLA starts each of its operations by itself, which takes longer than one on a few
-    numbers. A loop it compiles as a whole, see `linkax.xla.flags`, and this is a loop that runs once, without products
-    of matrices. In a batch, where one operation concerns many numbers, and on other devices it is no loop. Not to be
-    differentiated backwards.
+    XLA starts each operation of a program by itself, which takes longer than one on few numbers runs. A loop it
+    compiles as a whole, see `linkax.xla.flags`. So the function becomes a loop that runs once, without products of
+    matrices. In a batch, where one operation has many numbers, and on other devices it stays as it is. Not
+    differentiable backwards.
 
     **Arguments:** `when`, a Python bool, and `sound`, a bool array, as functions of the same arguments. Where `sound`
-    is false there are no numbers.
+    is false, results are not a number.
     """
 
     def decorate(function):
@@ -47,7 +47,7 @@ def in_one_kernel(when, sound):
 
 
 def _alone_in_a_loop(plain, shapes):
-    """A function of `sound` and arrays, as a loop that runs once; in batches and on other devices as it is."""
+    """A function of (sound, arrays) as a loop that runs once; as it is in batches and on other devices."""
 
     def looping(sound, dynamic):
         once = lambda carry: (jnp.zeros_like(sound), with_products_as_sums(plain)(sound, dynamic))
@@ -71,7 +71,7 @@ def _undefined(shape):
 
 
 def where_finite(function, array, otherwise):
-    """function(array), as a branch of its own, taken where the array is finite; elsewhere `otherwise`.
+    """Compute function(array) as a branch of its own where the array is finite; elsewhere return `otherwise`.
 
     The branch is for speed: XLA runs a computation on the CPU without the cost of scheduling its parts (half of the
     time for a small mechanism) where it touches small arrays only, and inlined into a solver's step it would touch the

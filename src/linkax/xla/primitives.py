@@ -1,13 +1,13 @@
-"""Operations with rules of their own in both modes of differentiation, and loops that have reverse mode."""
+"""Functions with their own rules in both modes of differentiation, and loops that have reverse mode."""
 
 import equinox.internal as eqxi
 
 
 def primitive(name, evaluate, abstract, jvp, transpose):
-    """A function as a primitive of JAX: only so can one function have a forward and a backward rule.
+    """Make a primitive of JAX: only so can one function have a rule for each mode of differentiation.
 
-    **Arguments:** `abstract`: shapes of what `evaluate` returns; `jvp`: (primals, tangents) -> (value, tangent);
-    `transpose`: (arguments, cotangent) -> cotangents of the arguments that the function is linear in, None for others.
+    **Arguments:** `evaluate`: the function; `abstract`: shapes of its results; `jvp`: (primals, tangents) ↦ (value,
+    tangent); `transpose`: (arguments, cotangent) ↦ cotangents, None for arguments in which the function is not linear.
     """
     made = eqxi.create_vprim(
         name,
@@ -20,5 +20,5 @@ def primitive(name, evaluate, abstract, jvp, transpose):
 
 
 def bounded_while_loop(condition, body, begin, max_steps: int):
-    """A `while` loop of at most `max_steps`, with derivatives in both modes."""
+    """Run a `while` loop of at most `max_steps` iterations, differentiable in both modes."""
     return eqxi.while_loop(condition, body, begin, max_steps=max_steps, kind="bounded")

@@ -15,10 +15,10 @@ FEW_MULTIPLICATIONS = 2**12  # which take no longer as a sum than a library take
 
 
 def with_products_as_sums(function):
-    """A function of arrays whose products of small matrices are sums of products of numbers, where loops are kernels.
+    """Decorate a function of arrays: replace its products of small matrices by sums, where loops are kernels.
 
-    XLA leaves products of matrices on a CPU to a library, which the kernel of a loop cannot call (jaxlib 0.12). Those
-    of transformations that have been applied within the function, and of functions of users, are among them.
+    XLA leaves products of matrices on a CPU to a library, which the kernel of a loop cannot call (jaxlib 0.12).
+    Products inside of transformations applied within the function, and in functions of users, are replaced too.
     """
 
     @wraps(function)
@@ -33,7 +33,7 @@ def with_products_as_sums(function):
 
 
 def _summed(part, known):
-    """A part of a traced function with products as sums; `known`: what has become of those before, by identity."""
+    """Replace products in a part of a traced function; `known`: what earlier parts became, by identity."""
     if type(part) is tuple:  # of branches
         return tuple(_summed(of, known) for of in part)
     if not isinstance(part, Jaxpr | ClosedJaxpr):
@@ -62,7 +62,7 @@ def _summed_equation(equation, known):
 
 @cache
 def _sum_of_products(axes, left, right):
-    """The call of what is `jax.lax.dot_general`: its axes are those shared, those of the left, those of the right."""
+    """The call that computes `jax.lax.dot_general`: axes shared, axes of the left, axes of the right."""
     contracted, shared = axes
     own = [
         [i for i in range(array.ndim) if i not in (*c, *s)] for array, c, s in zip((left, right), *axes, strict=True)

@@ -1,7 +1,7 @@
-"""Values put at places of an array that are known when a program is compiled.
+"""Writing to indices that are known when a program is compiled.
 
-By reading each entry of the result from where it comes from. XLA's scatter, which writes, takes a step for each value
-on a CPU, and cannot be part of a larger kernel there (see `linkax.xla.flags`).
+Each entry of the result reads where it comes from. XLA's scatter, which writes, takes a step for each value on a CPU,
+and cannot be part of a larger kernel there (see `linkax.xla.flags`).
 """
 
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def scatter_static(onto, places, values):
-    """`onto` (n, …) with values at places along its first axis, as many of both; neither needs to be flat."""
+    """Write values to indices along the first axis of `onto`, (n, …); indices and values need not be flat."""
     places = np.ravel(places)
     if not len(places):
         return onto

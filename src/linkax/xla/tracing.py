@@ -1,8 +1,8 @@
-"""What JAX traces, and as which program.
+"""What JAX traces, and into which program.
 
 Before XLA compiles a simulation, JAX traces it in Python, which takes about as long. The same equations stand in
 several places of a program, and each transformation (`vmap`, `grad`) walks through all of it again, more than once
-where there are loops. Of a function marked `jit_inline` JAX keeps what it has found for each kind of arguments. XLA
+where there are loops. Of a function marked `jit_inline` JAX keeps what it has traced for each kind of arguments. XLA
 compiles it in place, so that it runs as fast as without the mark.
 """
 
@@ -18,12 +18,12 @@ jit_inline = eqx.filter_jit
 
 
 def concrete(number) -> np.ndarray | None:
-    """The number as a NumPy array, or None while a transformation traces it."""
+    """Return a number as a NumPy array, or None while a transformation traces it."""
     return None if isinstance(number, jax.core.Tracer) else np.asarray(number)
 
 
 def all_concrete(tree) -> bool:
-    """Whether no array of a tree is traced by a transformation."""
+    """Whether no array in a tree is traced by a transformation."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -36,21 +36,21 @@ class Program:
         self._quick = cache(lambda: eqx.filter_jit(function, compiler_options=quickest_to_compile()))
 
     def choose(self, quick: bool, *args):
-        """The function to call with these arguments: the quick one for concrete ones only.
+        """Choose what to call with these arguments: the quick program for concrete ones only, if asked for.
 
-        That one is compiled by itself also inside of a transformation, which has no part in it.
+        Inside of a transformation that one is compiled by itself all the same.
         """
         return partial(evaluate_now, self._quick()) if quick and all_concrete(args) else self.optimised
 
 
 def quick_compile(function):
-    """A function for a program that is seldom run more than once on the same kind of arguments, see `Program`."""
+    """Decorate a function that seldom runs more than once on the same kind of arguments, see `Program`."""
     program = Program(function)
     return wraps(function)(lambda *args: program.choose(True, *args)(*args))
 
 
 def evaluate_now(function, *args):
-    """function(*args) of concrete arguments, computed at once, also where a transformation is tracing around it."""
+    """Compute function(*args) of concrete arguments at once, also while a transformation is tracing."""
     # Not `jax.ensure_compile_time_eval`: with it JAX compiles each operation on constants by itself.
     with jax.core.eval_context():
         return function(*args)

@@ -1,4 +1,4 @@
-"""Derivatives that do not exist, as numbers that are none.
+"""Derivatives that do not exist, as NaN.
 
 JAX gives zero where a result does not follow its inputs, and zero says "at an optimum" to whoever descends along it.
 """
@@ -14,10 +14,10 @@ from linkax.xla.primitives import primitive
 
 @eqx.filter_custom_jvp
 def undefined_where(undefined, values, inputs):
-    """Values as they are, without derivatives by `inputs` where `undefined`.
+    """Return `values` as they are, with undefined derivatives by `inputs` where `undefined`.
 
-    Forwards these are not a number. Backwards so are the cotangents of all inputs, but for values that had no
-    cotangent: those that a loss leaves out, such as failed members of a batch, spoil nothing.
+    Forwards these are NaN. Backwards so are the cotangents of all inputs, unless the value has no cotangent: what a
+    loss leaves out, such as failed members of a batch, spoils nothing.
 
     **Arguments:** `values`: pytree of arrays; `undefined`: of booleans that broadcast to them; `inputs`: what the
     values were computed from.
