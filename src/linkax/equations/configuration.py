@@ -1,8 +1,7 @@
 """Poses of all bodies by recursion along the tree, all bodies at once.
 
-Vectors are in ground axes. A sum along the way from ground to each body is a product with the
-topology's `path`; only orientations need products along the way (by pointer doubling).
-Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 4, gives the recursions.
+Vectors are in ground axes. Sums from ground to each body are products with the topology's `path`; only orientations
+need products along the way. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 4, gives the recursions.
 """
 
 import equinox as eqx
@@ -28,21 +27,21 @@ from linkax.xla.tracing import jit_inline
 
 
 class Configuration(eqx.Module):
-    """Where all bodies are at time t and coordinates q. Last row of body arrays with n_b + 1 rows: ground.
+    """Poses of all bodies at time t and coordinates q. Last row of body arrays with n_b + 1 rows: ground.
 
     - `rotation`: orientation of each body, axes as columns, (n_b + 1, 3, 3).
     - `link`: from the predecessor's reference point to the body's, without anchors [m], (n_b, 3).
     - `position`: reference point of each body from the anchor of its tree [m], (n_b + 1, 3).
     - `joint_axes`: h¹, h², h³ of each joint on its parent, as columns, (n_j, 3, 3).
-    - `parent_arm`, `child_arm`: from the reference point of each joint's parent to the origin
-      of the child's frame (tree joints) or of the parent's frame (cut joints), and from the
-      child's to that of the child's frame [m], (n_j, 3).
-    - `angular`, `sliding`: motion subspace of each of the topology's `motions`: angular velocity, and velocity
-      at the origin of the child's frame, of the moved body per unit speed, (n_m, 3).
+    - `parent_arm`, `child_arm`: from the reference point of each joint's parent to the origin of the child's frame
+      (tree joints) or of the parent's frame (cut joints), and from the child's to that of the child's frame [m], (n_j,
+      3).
+    - `angular`, `sliding`: motion subspace of each of the topology's `motions`: angular velocity, and velocity at the
+      origin of the child's frame, of the moved body per unit speed, (n_m, 3).
     - `linear`: the same velocity at the anchor of the tree, (n_m, 3).
     - `child_axes`: h¹, h², h³ of each cut joint on its child, as columns, (n_cut, 3, 3).
-    - `separation`: of each cut joint, from the origin on the parent to that on the child [m],
-      (n_cut, 3). It is summed around the loop from the common ancestor, not from the world's origin.
+    - `separation`: s of each cut joint, from the origin on the parent to that on the child [m], (n_cut, 3), summed
+      around the loop from the common ancestor, not from the world's origin.
     """
 
     system: System
@@ -83,11 +82,11 @@ class Configuration(eqx.Module):
         return GROUND_INDEX if name == GROUND_NAME else self.system.topology.bodies.index(name)
 
     def arm(self, frame: Frame) -> Float[Array, "3"]:
-        """From the reference point of a frame's body to its origin, in ground axes [m]."""
+        """Vector from the reference point of a frame's body to the frame's origin, in ground axes [m]."""
         return self.rotation[self.body(frame.body)] @ jnp.asarray(frame.offset, self.system.dtype)
 
     def axes(self, frame: Frame) -> Float[Array, "3 3"]:
-        """Axes of a frame, as columns."""
+        """Axes of a frame in ground axes, as columns."""
         return self.rotation[self.body(frame.body)] @ jnp.asarray(value(frame.rotation), self.system.dtype)
 
     def _place(self, frame):
@@ -102,16 +101,16 @@ class Configuration(eqx.Module):
         return sum(self._place(frame))
 
     def between(self, first: Frame, second: Frame) -> Float[Array, "3"]:
-        """From the origin of one frame to that of another [m]."""
+        """Vector from the origin of one frame to that of another [m]."""
         (near, near_anchor), (far, far_anchor) = self._place(first), self._place(second)
         return (far - near) + (far_anchor - near_anchor)
 
     def point_load(self, frame: Frame, force, moment=0.0) -> Load:
-        """A force at the origin of a frame, and a moment, in ground axes [N, N m]; on the ground they do nothing."""
+        """Make the load of a force at a frame's origin, and a moment, in ground axes [N, N m]; none on the ground."""
         return self.wrench(self.body(frame.body), self.arm(frame), force, moment)
 
     def wrench(self, body: int, arm, force, moment) -> Load:
-        """A force at a point of a body, and a moment."""
+        """Make the load of a force at a point of a body, and a moment [N, N m]."""
         none = Load.none(self.system)
         if body == GROUND_INDEX:
             return none
@@ -127,7 +126,7 @@ class Configuration(eqx.Module):
         return kind.measure(axes.T @ self.child_axes[cut], axes.T @ self.separation[cut])
 
     def joint_displacement(self, term: Term, origin) -> Float[Array, ""]:
-        """One coordinate of a joint from an origin; angles of a cut joint in [−π, π)."""
+        """A joint's coordinate less an origin [rad or m]; angles of a cut joint in [−π, π)."""
         index, topology = term.index or 0, self.system.topology
         if term.joint in topology.speeds:
             return coordinates_by_speed(topology, self.q)[topology.column(term)] - origin
@@ -144,7 +143,7 @@ class Configuration(eqx.Module):
     def cut_subspace(self, name: str):
         """Motion subspace of a cut joint in ground axes, angular and linear part, (n, 3) each.
 
-        Its columns dotted with a relative twist are the joint's speeds; as many wrenches are its forces.
+        Its columns dotted with the relative twist are the joint's speeds; as wrenches they are forces along the joint.
         """
         kind, axes, _ = self._cut(name)
         angular = jnp.asarray(np.array(kind.angular_subspace).reshape(-1, 3), axes.dtype)
@@ -155,12 +154,12 @@ class Configuration(eqx.Module):
 
 
 def wrapped(angles, is_angle):
-    """Differences of angles brought into [−π, π); lengths left as they are."""
+    """Bring differences of angles into [−π, π); leave lengths as they are."""
     return jnp.where(is_angle, jnp.mod(angles + jnp.pi, 2.0 * jnp.pi) - jnp.pi, angles)
 
 
 def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " n_v"]:
-    """Generalised force of wrenches on bodies, (n_b, 3) each, the moment about the centre of mass."""
+    """Project wrenches on bodies, (n_b, 3) each, moments about the centre of mass, on the speeds: Σ Sᵀ w."""
     system, topology = configuration.system, configuration.system.topology
     body = topology.moved_body
     arm = configuration.position[:-1] + configuration.center_of_mass()
@@ -169,7 +168,7 @@ def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " 
 
 
 def beam_point(configuration: Configuration, beam: Beam, point) -> Float[Array, "3"]:
-    """A point (3,) fixed to the section of a beam at point[0], in the world [m]."""
+    """Position of a point (3,) fixed to the section of a beam at point[0], in the world [m]."""
     nodes = jnp.array([configuration.body(name) for name in beam.nodes])
     coordinates = configuration.joint_coordinates(beam.name)
     section, element = section_at(coordinates, beam.strains, beam.element_length, point[0])
@@ -186,7 +185,7 @@ def bodies_of_cuts(topology):
 
 @jit_inline
 def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
-    """Poses of all bodies and the motion subspaces of all joints at coordinates q."""
+    """Compute the poses of all bodies and the motion subspaces of all joints at coordinates q."""
     topology, count = system.topology, system.topology.num_bodies
     parent, child = np.array(topology.parent), np.array(topology.child)
     reversed_ = topology.reversed[:, None]

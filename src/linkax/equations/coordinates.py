@@ -1,7 +1,7 @@
 """Coordinates q that are not all integrals of speeds v: unit quaternions among them.
 
-Without a quaternion q̇ = v, and all of this is addition. Quaternions are those of
-`linkax.model.joints`: the child's axes in the parent's, speeds in axes of the parent.
+Without a quaternion q̇ = v, and all of this is addition. A quaternion turns the parent's axes into the child's; its
+angular velocity is in axes of the parent.
 """
 
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ def _places(topology):
 
 
 def _of_plain(topology, v):
-    """Speeds (n_v,) at the places of their coordinates (n_q,), zero for quaternions."""
+    """Put speeds (n_v,) at their coordinates (n_q,); zero for quaternions."""
     return scatter_static(jnp.zeros(topology.num_coordinates, v.dtype), topology.plain[:, 0], v[topology.plain[:, 1]])
 
 
@@ -33,7 +33,7 @@ def neutral(topology: Topology, dtype) -> Float[Array, " n_q"]:
 
 
 def retract(topology: Topology, q, change) -> Float[Array, " n_q"]:
-    """The coordinates after a change (n_v,) of a finite size: q ⊕ δ."""
+    """Add a finite change (n_v,) to coordinates: q ⊕ δ."""
     if not len(topology.quaternions):
         return q + change
     in_q, in_v = _places(topology)
@@ -42,7 +42,7 @@ def retract(topology: Topology, q, change) -> Float[Array, " n_q"]:
 
 
 def carried(topology: Topology, motion, change) -> Float[Array, " n_v"]:
-    """A small change of coordinates q as one of q ⊕ motion, (n_v,) each: quaternions take it along as they turn."""
+    """Carry a small change of q along to q ⊕ motion, (n_v,) each: quaternions turn it."""
     if not len(topology.quaternions):
         return change
     _, in_v = _places(topology)
@@ -51,7 +51,7 @@ def carried(topology: Topology, motion, change) -> Float[Array, " n_v"]:
 
 
 def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:
-    """The coordinates with quaternions of length one."""
+    """Normalise the quaternions."""
     if not len(topology.quaternions):
         return q
     in_q, _ = _places(topology)
@@ -69,7 +69,7 @@ def rates(topology: Topology, q, v) -> Float[Array, " n_q"]:
 
 
 def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
-    """The speeds v of which q̇ are the rates; small changes of q likewise."""
+    """The speeds v with rates q̇; small changes of q likewise."""
     if not len(topology.quaternions):
         return rates
     in_q, in_v = _places(topology)
@@ -78,7 +78,7 @@ def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
 
 
 def coordinates_by_speed(topology: Topology, q) -> Float[Array, " n_v"]:
-    """The coordinates at the places of their speeds, zero for those of quaternions."""
+    """The coordinate of each speed, (n_v,); zero for those of quaternions."""
     if not len(topology.quaternions):
         return q
     return scatter_static(jnp.zeros(topology.num_speeds, q.dtype), topology.plain[:, 1], q[topology.plain[:, 0]])

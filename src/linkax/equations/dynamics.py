@@ -1,8 +1,7 @@
 """Mass matrix, forces and energy of the spanning tree.
 
-M v̇ = f without loops; Featherstone (2008), ch. 5 (recursive Newton-Euler) and ch. 6 (composite
-rigid bodies). Inertias are carried from body to body about each one's own reference point, so
-that small bodies far out on a mechanism keep their digits.
+Featherstone (2008), ch. 5 (recursive Newton-Euler) and ch. 6 (composite rigid bodies). Inertias go from body to body
+about each one's own reference point, so that small bodies far out on a mechanism keep their digits.
 """
 
 from functools import reduce
@@ -27,7 +26,7 @@ def world_inertia(configuration: Configuration) -> Float[Array, "n_b 3 3"]:
 
 
 def _shifted(mass, first_moment, arm):
-    """What a second moment of mass gains when its reference moves back by `arm`, (n_b, 3, 3)."""
+    """Gain of a second moment of mass when its reference point moves back by `arm`, (n_b, 3, 3)."""
     product = (
         arm[:, :, None] * (mass[:, None] * arm + first_moment)[:, None, :] + first_moment[:, :, None] * arm[:, None, :]
     )
@@ -41,7 +40,7 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
 
 
 def mass_entries(configuration: Configuration) -> StaticSparse:
-    """`mass_matrix` by its entries: those of speeds of which one moves what the other does."""
+    """Entries of M that may differ from zero: pairs of speeds that move a common body."""
     system, topology = configuration.system, configuration.system.topology
     above = lambda carried: _onto_carrier(np.array(topology.predecessor), carried)
     arm = configuration.center_of_mass()
@@ -69,12 +68,12 @@ def mass_entries(configuration: Configuration) -> StaticSparse:
 
 
 def _onto_carrier(carrier, carried):
-    """Sum (n_b, …) of the bodies that each body carries directly."""
+    """Sum values (n_b, …) over the bodies that each body carries directly."""
     return constant_product(carrier[None, :] == np.arange(len(carrier))[:, None], carried)
 
 
 def applied_load(motion: Motion) -> Load:
-    """The sum of what all force elements apply."""
+    """Sum the loads of all force elements."""
     loads = [force.applied(motion.configuration.t, motion) for force in motion.system.forces]
     return reduce(Load.plus, loads, Load.none(motion.system))
 
@@ -82,7 +81,7 @@ def applied_load(motion: Motion) -> Load:
 def inertial_wrench(motion: Motion, angular_acceleration, acceleration):
     """Force m a [N] and moment I α + ω × I ω about the centre of mass [N m] of each body, (n_b, 3) each.
 
-    The accelerations are those of the bodies [rad/s²] and of their reference points [m/s²].
+    **Arguments:** accelerations of the bodies [rad/s²] and of their reference points [m/s²].
     """
     system, arm = motion.system, motion.configuration.center_of_mass()
     omega = motion.angular_velocity[:-1]
@@ -93,17 +92,17 @@ def inertial_wrench(motion: Motion, angular_acceleration, acceleration):
 
 
 def generalised_force(motion: Motion) -> Float[Array, " n_v"]:
-    """f of M v̇ = f: applied forces less velocity-product forces [N m, N]."""
+    """f of M v̇ = f + Jᵀλ: applied forces less velocity-product forces [N m, N]."""
     return _unbalanced(motion, motion.angular_bias[:-1], motion.bias[:-1])
 
 
 def unbalanced_force(motion: Motion, acceleration: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
-    """f − M v̇, by recursive Newton-Euler, without M [N m, N]."""
+    """f − M v̇ by recursive Newton-Euler, without forming M [N m, N]."""
     return _unbalanced(motion, *body_accelerations(motion, acceleration))
 
 
 def _unbalanced(motion, angular_acceleration, acceleration):
-    """Applied forces less what accelerations of the bodies and of their reference points take."""
+    """Applied forces less what given accelerations of bodies and reference points need."""
     load = applied_load(motion)
     force, moment = inertial_wrench(motion, angular_acceleration, acceleration)
     return load.joint_force + along_speeds(motion.configuration, load.force - force, load.moment - moment)
@@ -124,7 +123,7 @@ def potential_energy(configuration: Configuration) -> Float[Array, ""]:
 
 
 def body_accelerations(motion: Motion, acceleration: Float[Array, " n_v"]):
-    """Angular accelerations and accelerations of reference points at v̇, (n_b, 3) each."""
+    """Accelerations of bodies [rad/s²] and of their reference points [m/s²] at v̇, (n_b, 3) each."""
     configuration, system = motion.configuration, motion.system
     acceleration = expand_to_motions(system.topology, acceleration)[:, None]
     angular = along_path(system, sum_by_body(system, configuration.angular * acceleration))[:-1]

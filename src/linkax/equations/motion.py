@@ -1,4 +1,4 @@
-"""Twists of all bodies and their velocity-product accelerations, by recursion along the tree."""
+"""Twists and velocity-product accelerations of all bodies, by recursion along the tree."""
 
 from functools import partial
 
@@ -24,11 +24,10 @@ from linkax.xla.tracing import jit_inline
 
 
 class Motion(eqx.Module):
-    """How all bodies move at (t, q, v): what a force element reads, and how it makes its load.
+    """The motion of all bodies at (t, q, v): what a force element reads, and how it makes its load.
 
     - `angular_velocity` [rad/s], (n_b + 1, 3); `velocity` of reference points [m/s], (n_b + 1, 3).
-    - `angular_bias` [rad/s²], `bias` [m/s²]: accelerations that velocities alone cause (the
-      part without v̇), (n_b + 1, 3).
+    - `angular_bias` [rad/s²], `bias` [m/s²]: velocity-product accelerations, the part without v̇, (n_b + 1, 3).
     - `edge_rate`, `edge_turn`, `edge_bias`, `edge_angular_bias`: contributions of each tree
       joint to the four, (n_b, 3), for sums around a loop.
     """
@@ -75,7 +74,7 @@ class Motion(eqx.Module):
         return self.joint_speeds(term.joint)[term.index or 0]
 
     def joint_load(self, term: Term, force) -> Load:
-        """A torque [N m], or force [N] on a slide, along one speed of a joint, on the child."""
+        """Make the load of a torque [N m], or a force [N] on a slide, on the child along one speed of a joint."""
         topology, configuration, none = self.system.topology, self.configuration, Load.none(self.system)
         if term.joint in topology.speeds:
             return none._replace(joint_force=none.joint_force.at[topology.column(term)].set(force))
@@ -92,13 +91,13 @@ class Motion(eqx.Module):
         return self.velocity[body] + cross(self.angular_velocity[body], self.configuration.arm(frame))
 
     def point_bias(self, frame: Frame) -> Float[Array, "3"]:
-        """Acceleration of the origin of a frame that velocities alone cause [m/s²]."""
+        """Velocity-product acceleration of the origin of a frame [m/s²]."""
         body, arm = self.configuration.body(frame.body), self.configuration.arm(frame)
         omega = self.angular_velocity[body]
         return self.bias[body] + cross(self.angular_bias[body], arm) + cross(omega, cross(omega, arm))
 
     def point_load(self, frame: Frame, force, moment=0.0) -> Load:
-        """A force at the origin of a frame, and a moment, in ground axes [N, N m]; on the ground they do nothing."""
+        """Make the load of a force at a frame's origin, and a moment, in ground axes [N, N m]; none on the ground."""
         return self.configuration.point_load(frame, force, moment)
 
 
@@ -108,7 +107,7 @@ def _alone(values):
 
 @jit_inline
 def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
-    """Twists and velocity-product accelerations of all bodies at speeds v."""
+    """Compute twists and velocity-product accelerations of all bodies at speeds v."""
     system = configuration.system
     topology, count = system.topology, system.topology.num_bodies
     parent, child = np.array(topology.parent)[:count], np.array(topology.child)[:count]
@@ -147,7 +146,7 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
 
 
 def _subspace_bias(configuration, v):
-    """Accelerations of each joint's child by motion subspaces that change with coordinates, (n_b, 3) each.
+    """Accelerations of the joints' children by motion subspaces that change with coordinates, Ṡ v, (n_b, 3) each.
 
     **Returns:** angular and linear ones, seen from the parent, in ground axes; None where there are none.
     """
@@ -164,7 +163,7 @@ def _subspace_bias(configuration, v):
 
 
 def _scattered(topology, parts):
-    """Values (n, 3) of bodies, (n_b, 3) of all; None for none."""
+    """Put values (n, 3) of bodies into (n_b, 3); None for none."""
     if not parts:
         return None
     members, values = np.concatenate([np.array(bodies) for bodies in parts]), jnp.concatenate([*parts.values()])
@@ -178,7 +177,7 @@ def _turning(kind, coordinates, speeds):
 
 @whole_jacobian
 def _bending(motion, coordinates, speeds, numbers):
-    """Angular and linear acceleration of a `Motion` at constant speeds."""
+    """Angular and linear acceleration of a `RelativeMotion` at constant speeds."""
     place = lambda coordinates: motion(coordinates, numbers)
     rate = lambda coordinates: jax.jvp(place, (coordinates,), (speeds,))[1]
     at, accelerations = place(coordinates), jax.jvp(rate, (coordinates,), (speeds,))[1]

@@ -1,4 +1,4 @@
-"""Reactions of all joints at one instant, from accelerations and multipliers."""
+"""Reactions of all joints from accelerations and multipliers: the paper's Table 3 and Fig. 6."""
 
 from typing import Literal, NamedTuple
 
@@ -21,7 +21,7 @@ Axes = Literal["ground", "joint"]
 
 
 class Reaction(NamedTuple):
-    """What a joint does to its child, in ground axes, unless it was asked for otherwise.
+    """The wrench of a joint on its child, in ground axes unless asked for otherwise.
 
     - `force` [N], and `moment` about the origin of the child's frame [N m], (…, 3) each. The
       parent receives the opposite force at the same point, and the opposite moment.
@@ -32,9 +32,11 @@ class Reaction(NamedTuple):
 
 
 def cut_reactions(configuration: Configuration, multipliers, immobile=None) -> Reaction:
-    """Reactions of the cut joints, (n_cut, 3) each: the paper's Table 3, by virtual power.
+    """Reactions of the cut joints on their children, (n_cut, 3) each, by virtual power: the paper's Table 3.
 
-    `immobile`: multipliers of the rows that no motion changes; zero by default.
+    A rotation row h₁ⁱ·h₂ʲ with multiplier λ is a moment λ h₂ʲ × h₁ⁱ, a translation row h₁ⁱ·s / ℓ a force λ h₁ⁱ / ℓ.
+
+    **Arguments:** `immobile`: multipliers of the rows that no motion changes; zero by default.
     """
     found = sorted_multipliers(configuration, multipliers)
     nothing = jnp.zeros_like(configuration.separation)
@@ -56,9 +58,9 @@ def _added(reaction: Reaction, rows: RowVectors, multipliers) -> Reaction:
 
 
 def reactions(motion: Motion, acceleration, multipliers) -> Reaction:
-    """Reactions of all joints, (n_j, 3) each, tree joints first.
+    """Reactions of all joints on their children, (n_j, 3) each, tree joints first.
 
-    A tree joint carries what its subtree needs: inertia less applied loads less the reactions
+    A tree joint carries what its subtree needs: inertial wrenches less applied loads less the reactions
     of cut joints on it (recursive Newton-Euler; the paper's Fig. 6).
     """
     load, cut = applied_load(motion), cut_reactions(motion.configuration, multipliers)
@@ -68,13 +70,13 @@ def reactions(motion: Motion, acceleration, multipliers) -> Reaction:
 
 
 def reactions_to(configuration: Configuration, multipliers, immobile) -> Reaction:
-    """The part of all joints' reactions that multipliers alone cause, (n_j, 3) each."""
+    """The part of all reactions that multipliers alone cause, (n_j, 3) each."""
     cut = cut_reactions(configuration, multipliers, immobile)
     return _carried(configuration, Load.none(configuration.system), cut, multipliers)
 
 
 def seen_from(configuration: Configuration, reactions: Reaction, on: Side, axes: Axes) -> Reaction:
-    """Reactions of all joints on a body, at its own frame's origin, in ground axes or its joint axes."""
+    """Refer reactions of all joints to a body, at its own frame's origin, in ground axes or its joint axes."""
     system, topology = configuration.system, configuration.system.topology
     parent, child = np.array(topology.parent), np.array(topology.child)
     force, moment = reactions
@@ -91,7 +93,7 @@ def seen_from(configuration: Configuration, reactions: Reaction, on: Side, axes:
 
 
 def _carried(configuration: Configuration, needed: Load, cut: Reaction, multipliers) -> Reaction:
-    """Reactions where bodies need wrenches, and tree joints already have forces along their speeds."""
+    """Reactions of all joints where bodies need wrenches, and tree joints have forces along their speeds already."""
     system, topology = configuration.system, configuration.system.topology
     count = topology.num_bodies
     force, moment, joint_force = needed

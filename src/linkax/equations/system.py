@@ -57,12 +57,12 @@ class System(eqx.Module):
 
     @property
     def structure(self) -> Structure:
-        """Islands and elimination plan of its equations."""
+        """Islands and elimination plan of the equations."""
         return structure_of(self.topology)
 
     @property
     def scales(self) -> Float[Array, " n_v"]:
-        """What one unit of each speed, or of a small change, is: 1 rad, or the mechanism's length [m]."""
+        """One unit of each speed, or small change: 1 rad, or the mechanism's length [m]."""
         return jnp.where(self.topology.slides, self.length, jnp.ones((), self.dtype))
 
     def fastest(self, v) -> Float[Array, ""]:
@@ -71,10 +71,10 @@ class System(eqx.Module):
 
 
 def system_of(mechanism: Mechanism, dtype, fixed_scales: bool = True) -> System:
-    """Stack the numbers of a mechanism in the given floating-point type.
+    """Stack the numbers of a mechanism in a floating-point type.
 
-    `fixed_scales`: the lengths that are units have no derivative, since no motion depends on them. What is
-    told in them does, such as the distance from a singular configuration.
+    **Arguments:** `fixed_scales`: lengths that serve as scales have no derivative, since no motion depends on them;
+    what is told in them does, such as the distance from a singular configuration.
     """
     topology, joints = mechanism.topology, mechanism.joints
 
@@ -140,7 +140,7 @@ def _coupling_unit(mechanism, coefficients, length):
 def _lengths(topology, parent_offset, child_offset, center_of_mass, bent):
     """Half the way around each loop, and the larger of these and of the reach from ground [m].
 
-    `bent`: what joints that bend add to a way, (n_j,); None where there are none.
+    **Arguments:** `bent`: length that joints on beams add to a way, (n_j,); None where there are none.
     """
     ends = jnp.concatenate([parent_offset, child_offset])  # joint j: rows j and n_j + j
     distance = lambda pairs: length_of(ends[pairs[:, 0]] - ends[pairs[:, 1]])

@@ -21,7 +21,7 @@ from linkax.xla.tracing import jit_inline
 
 
 def parameter(default: float, what: str):
-    """A field for a traced number of a method, zero or more; `what` names it in errors."""
+    """Make a field for a traced number of a method, zero or more; `what` names it in errors."""
     return eqx.field(default=default, converter=partial(zero_or_more, what=what))
 
 
@@ -32,7 +32,7 @@ class AbstractAcceleration(eqx.Module):
     def __call__(
         self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"], force: Float[Array, " n"], gamma
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """v̇ and λ, of at least one row; not finite where the way fails."""
+        """Solve for v̇ and λ, of at least one row; not finite where the way fails."""
 
 
 class AbstractCorrection(eqx.Module):
@@ -40,7 +40,7 @@ class AbstractCorrection(eqx.Module):
 
     @abc.abstractmethod
     def right_inverse(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"]) -> Float[Array, "n m"]:
-        """G with J G r = r for r in the range of J: the loops are closed by the change −G c."""
+        """G with J G r = r for r in the range of J; the change −G c closes the loops."""
 
 
 class Baumgarte(eqx.Module):
@@ -108,7 +108,7 @@ class ClassicalFormulation(AbstractFormulation):
         return self.correction is not None
 
     def _solved(self, at: LinearSystem, v) -> Dynamics:
-        """v̇ and λ, and what v̇ violates of the rows without stabilisation."""
+        """Solve for v̇ and λ, and for what v̇ violates of the rows without stabilisation."""
         system, motion = at.configuration.system, move(at.configuration, v)
         force, right, scales = generalised_force(motion), gamma(motion), system.scales
         mass, rows = _in_units(at)

@@ -8,7 +8,7 @@ from linkax.formulations.classical import AbstractAcceleration
 
 
 class LagrangeMultipliers(AbstractAcceleration):
-    """Accelerations and multipliers of the constrained equations, by LU; fails where rows depend on one another.
+    """Solve the constrained equations for v̇ and λ by LU; fails where rows depend on one another.
 
     García de Jalón and Bayo, Kinematic and Dynamic Simulation of Multibody Systems, 1994, ch. 5.
 

@@ -1,4 +1,4 @@
-"""Why a simulation failed: the elements to blame, found after the run."""
+"""Why a run failed: the elements to blame, looked for after the run."""
 
 import equinox as eqx
 import jax
@@ -26,9 +26,9 @@ NULL = 1e-10  # eigenvalue of a mass matrix of ones
 
 
 def cause(solution) -> str:
-    """A sentence that names the elements at fault, or nothing where none is found.
+    """Name the elements at fault in a sentence; an empty string where none is found.
 
-    **Arguments:** a failed `Solution`.
+    **Arguments:** `solution`: of a run that failed.
     """
     state = solution.run.state
     system = system_of(solution.mechanism, state.q.dtype)
@@ -67,7 +67,7 @@ def _not_finite(mechanism):
 
 
 def _forces(solution, system, t, state):
-    """Force elements whose load is not finite."""
+    """Name a force element whose load is not finite."""
     motion = move(configure(system, jnp.asarray(t), state.q), state.v)
     for force in solution.mechanism.forces:
         load = force.applied(jnp.asarray(t), motion)
@@ -77,7 +77,7 @@ def _forces(solution, system, t, state):
 
 
 def _laws(mechanism, t):
-    """Constraints whose function of time, or its first two derivatives, is not finite."""
+    """Name a constraint whose function of time, or one of its first two derivatives, is not finite."""
     for constraint in mechanism.constraints:
         rate = jax.jacfwd(constraint.right_side)
         if not all(bool(jnp.isfinite(law(t))) for law in (constraint.right_side, rate, jax.jacfwd(rate))):
@@ -87,7 +87,7 @@ def _laws(mechanism, t):
 
 
 def _ahead(solution, system, t):
-    """The same a little after the end of the run, where its last step failed."""
+    """Name such a force element a little after the end of the run, where its last step failed."""
     for ahead in AHEAD * float(jnp.max(jnp.abs(t)) + 1.0):
         if found := _forces(solution, system, t + ahead, solution.end):
             return found
@@ -95,7 +95,7 @@ def _ahead(solution, system, t):
 
 
 def _no_acceleration(solution, system, method, t):
-    """A classical formulation that finds no acceleration where the run ends."""
+    """Say why a classical formulation finds no acceleration where the run ends."""
     if not isinstance(solution.formulation, ClassicalFormulation):
         return ""
     end = solution.end
@@ -109,7 +109,7 @@ def _no_acceleration(solution, system, method, t):
 
 
 def _drives(solution, system, t):
-    """Drives that ask for what the loops do not allow just after the end of the run."""
+    """Name drives that ask for what the loops do not allow just after the end of the run."""
     drives = [constraint for constraint in solution.mechanism.constraints if isinstance(constraint, Drive)]
     method, end = solution.run.tangent_space.prepared(system.dtype, solution.rank_nearby), solution.end
     small = jnp.sqrt(jnp.finfo(system.dtype).eps)
@@ -122,7 +122,7 @@ def _drives(solution, system, t):
 
 
 def _contradiction(solution, system, t):
-    """Loops that stay open where a step failed, by more than rounding."""
+    """Name loops that stay open by more than rounding where a step failed."""
     end = solution.end
     if solution.result != RESULTS.dt_min_reached or not system.topology.num_rows or not np.all(np.isfinite(end.q)):
         return ""
@@ -137,13 +137,13 @@ def _contradiction(solution, system, t):
 
 
 def _open(system, mechanism, t, q):
-    """Where the loops are open."""
+    """Name the joint or constraint that is open widest."""
     name, size = _widest(system, mechanism, t, q)
     return f" Joint {name!r} is open by {size:.3g}, in radians or lengths of the mechanism."
 
 
 def _widest(system, mechanism, t, q):
-    """The joint or constraint at which the loops are widest open, and by how much."""
+    """The joint or constraint that is open widest, and by how much."""
     gap, topology = gaps(configure(system, t, q)).in_scales(system), mechanism.topology
     names = [*topology.joints[topology.num_bodies :], *topology.constraints]
     sizes = np.concatenate([np.maximum(gap.distance, gap.angle), gap.constraints])
@@ -152,7 +152,7 @@ def _widest(system, mechanism, t, q):
 
 
 def lost_inertia(system, below=LOST):
-    """A body of which rounding leaves little in the inertia about its joint, next to what it carries far out."""
+    """Name a body whose inertia about its joint rounding loses, next to that of a body it carries far out."""
     topology, carrier = system.topology, np.array(system.topology.predecessor)
     offsets = np.stack([system.parent_offset, system.child_offset], axis=1)[: topology.num_bodies]
     near = np.where(topology.reversed, 1, 0)  # the joint's end on the carrier
@@ -179,7 +179,7 @@ def lost_inertia(system, below=LOST):
 
 
 def massless_bodies(system, method, t, q):
-    """Bodies that can move without moving any mass: magnitudes of masses do not matter, so all are one."""
+    """Names of bodies that can move without moving any mass; magnitudes do not matter, so all masses are set to one."""
     moment = jnp.max(jnp.abs(system.inertia), axis=(1, 2))
     inertia = ratio(system.inertia, moment[:, None, None], 0.0) * system.length**2
     equal = eqx.tree_at(lambda s: (s.mass, s.inertia), system, (ratio(system.mass, system.mass, 0.0), inertia))

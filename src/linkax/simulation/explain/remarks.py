@@ -1,4 +1,4 @@
-"""What there is to say of a simulation that ended well: see `linkax.REMARKS`, and why, with the elements to blame."""
+"""Remarks on a run that ended well, see `linkax.REMARKS`, and their causes with the elements to blame."""
 
 import diffrax
 import equinox as eqx
@@ -30,7 +30,7 @@ RESOLVED = 5.0  # the same, below which an explicit solver takes about as many s
 
 
 def remark(solution) -> REMARKS:
-    """What there is to say of a run that ended well, or of each of a batch: the first of `REMARKS` that applies."""
+    """The first of `REMARKS` that applies to a run that ended well, or to each of a batch."""
     known, found = _known(solution), np.zeros(solution.t_end.shape, np.int32)
     numeric = np if known is np.asarray else jnp
     if solution.run.is_integrated:
@@ -42,7 +42,9 @@ def remark(solution) -> REMARKS:
 
 
 def in_words(solution, *names) -> str:
-    """The first of these `REMARKS` that applies to a run, ended well or not, with numbers and elements; or nothing."""
+    """Explain the first of these `REMARKS` that applies to a run, ended well or not, with numbers and elements; or
+    nothing.
+    """
     for applies, tell in map(_FINDINGS.get, names):
         if applies(solution, np.asarray):
             return tell(solution)
@@ -50,7 +52,7 @@ def in_words(solution, *names) -> str:
 
 
 def _known(solution):
-    """Numbers of a run as NumPy's, which compile nothing, unless they are traced."""
+    """The function that makes numbers of a run NumPy arrays, which compile nothing, or of traced ones JAX arrays."""
     found = solution.t_end, solution.v, solution.stats, solution.result, solution.average, solution.definiteness
     return np.asarray if all_concrete(found) else jnp.asarray
 
@@ -107,7 +109,7 @@ def _lingered(solution):
 
 
 def _is_stiff(solution, known):
-    """Whether the rate of an element, and not the motion, chooses the steps; rates are found where steps are many."""
+    """Whether the rate of an element, and not the motion, chooses the steps; computed only where steps are many."""
     never = np.zeros(solution.t_end.shape, bool)
     suspect = known(solution.stats["num_steps"]) >= MANY_STEPS
     if solution.v is None or not solution.mechanism.forces or (known is np.asarray and not np.any(suspect)):
@@ -153,7 +155,7 @@ def _mean_step(solution):
 
 
 def _mean_speed(solution):
-    """Of the fastest joint, over saved times; not a number where none was reached."""
+    """Mean speed of the fastest joint over saved times; NaN where none was reached."""
     scales = _per_member(_scales, *_ends(solution))
     turns, reached = (
         jnp.max(jnp.abs(solution.v / scales[..., None, :]), axis=-1, initial=0.0),
@@ -167,7 +169,7 @@ def _ends(solution):
 
 
 def _per_member(function, mechanism, tangent_space, t, state):
-    """Of what is at the end of a run, or of each of a batch."""
+    """Map a function of the end of a run over the members of a batch."""
     for _ in range(t.ndim):
         function = eqx.filter_vmap(function)
     return function(mechanism, tangent_space, t, state)
@@ -193,7 +195,7 @@ def _rates_of_elements(mechanism, tangent_space, t, state):
 
 
 def _elements(mechanism, tangent_space, t, state):
-    """Masses in directions that the loops leave, stiffness and damping there of each force element, (n, n_v, n_v)."""
+    """Mass matrix on the tangent space, and stiffness and damping of each force element there, (n, n_v, n_v)."""
     system = system_of(mechanism, state.q.dtype)
     found = tangent_space.prepared(system.dtype).at_rest(system, t, state.q)
     basis, still = found.split.inverse.basis, jnp.zeros_like(state.v)

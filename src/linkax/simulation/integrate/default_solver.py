@@ -1,4 +1,4 @@
-"""Which solver integrates a mechanism where none is asked for."""
+"""The solver of a run where none is asked for."""
 
 import diffrax
 import jax.numpy as jnp
@@ -12,9 +12,9 @@ LONG = 2**15  # radians of the fastest wave: an explicit step takes 2 to 3, and 
 
 
 def default_solver(mechanism: Mechanism, rtol, duration) -> diffrax.AbstractSolver:
-    """`Dopri8`, or for some mechanisms with beams `Kvaerno5`, implicit, whose steps fast waves do not choose.
+    """Choose `Dopri8`, or for some mechanisms with beams `Kvaerno5`, implicit, whose steps fast waves do not choose.
 
-    Of undamped waves an implicit solver has to follow those that the motion excites as an explicit one does, with lower
+    An implicit solver has to follow undamped waves that the motion excites as an explicit one does, with lower
     order and at ten times the cost of a step. It is better where they are damped faster than they turn, where the
     tolerance is loose, and in runs so long that they keep an explicit one from their end.
 

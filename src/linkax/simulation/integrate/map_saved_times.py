@@ -1,4 +1,4 @@
-"""Functions of the rows of a solution, of which many may never have been saved."""
+"""A map over saved times, of which many may never have been reached."""
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,9 @@ ROWS = 16  # evaluated at a time: few share the price of one close to a singular
 
 
 def map_saved_times(function, saved, *arrays):
-    """A function of each row of some arrays; not a number, zero or false where the row was not saved.
+    """Map a function over rows of arrays; NaN, zero or false where the row was not saved.
 
-    Goes through the rows in parts. A part of which nothing was saved costs nothing, and one close
+    The map goes in parts. A part of which nothing was saved costs nothing, and one close
     to a singular configuration is no dearer for the others. Differentiable in both modes.
 
     **Arguments:** `function`: of one row of each array; `saved`: which rows were, (n,); arrays (n, ...).

@@ -1,4 +1,4 @@
-"""Options of a run, most of them diffrax's own objects, checked before anything is compiled."""
+"""Checks of the options of a run, most of them diffrax's own objects, before anything is compiled."""
 
 import diffrax
 import jax
@@ -23,7 +23,7 @@ FLOATS = ("float64", "float32")
 
 
 def check_kinds(**options):
-    """Whether options that are not None are of diffrax's kinds: objects, not classes or numbers."""
+    """Check that options that are not None are diffrax's objects, not classes or numbers."""
     for name, entry in options.items():
         kind, example = KINDS[name]
         if entry is not None:
@@ -35,7 +35,7 @@ def check_kinds(**options):
 
 
 def check_steps(solver, controller, dt0, max_steps, t0, t1):
-    """Whether a solver for ordinary differential equations can be stepped so; returns dt0 as an array, or None."""
+    """Check that a solver and a step control fit each other and the run; return dt0 as an array, or None."""
     if solver.term_structure is not diffrax.AbstractTerm:
         kind = type(solver).__name__
         raise ValueError(f"solver is {kind}, for equations of several terms; give another, such as diffrax.Dopri8()")
@@ -59,19 +59,19 @@ def check_steps(solver, controller, dt0, max_steps, t0, t1):
 
 
 def check_accuracy(accuracy):
-    """Whether this is one."""
+    """Check that this is a `linkax.Accuracy`."""
     presets = "give linkax.DRAFT, BALANCED, PRECISE or linkax.Accuracy(rtol=...)"
     require_type(accuracy, Accuracy, "accuracy", presets)
 
 
 def estimates_errors(solver) -> bool:
-    """Whether steps can adapt to what it estimates."""
+    """Whether a solver estimates the error of its steps."""
     tableau = getattr(solver, "tableau", None)
     return isinstance(solver, diffrax.AbstractAdaptiveSolver) and (tableau is None or bool(np.any(tableau.b_error)))
 
 
 def traced_tolerances(controller):
-    """Tolerances given as Python floats made arrays, so that another value compiles nothing anew."""
+    """Make arrays of tolerances given as Python floats, so that another value compiles nothing anew."""
     what = "stepsize_controller: a tolerance"
 
     def traced(tolerance):
@@ -83,7 +83,7 @@ def traced_tolerances(controller):
 
 
 def check_saved_times(saveat, t0, t1, max_steps):
-    """Whether the times to save are in order, from t0 to t1 [s], and steps that are saved have a largest number."""
+    """Check that saved times are in order from t0 to t1 [s], and that saved steps have a largest number."""
     if max_steps is None and (saveat.dense or any(sub.steps for sub in _subs(saveat))):
         raise ValueError("max_steps is None, and saveat keeps all steps; give their largest number, such as 4096")
     for ts in saved_times(saveat):
@@ -117,7 +117,7 @@ def _check_times(ts, what, t0, t1):
 
 
 def floating(dtype) -> np.dtype:
-    """The type of the numbers of a run."""
+    """Check the floating-point type of a run."""
     try:
         is_array = isinstance(dtype, jax.Array | np.ndarray | np.generic)
         found = "none" if is_array else jnp.dtype(float if dtype is None else dtype).name
@@ -129,6 +129,6 @@ def floating(dtype) -> np.dtype:
 
 
 def with_tolerances(change, tree):
-    """A pytree with all entries named rtol or atol changed."""
+    """Change all entries of a pytree that are named rtol or atol."""
     named = lambda path: path and getattr(path[-1], "name", None) in ("rtol", "atol")
     return jax.tree_util.tree_map_with_path(lambda path, leaf: change(leaf) if named(path) else leaf, tree)

@@ -1,4 +1,4 @@
-"""Any diffrax solver, with the state put back on the closed loops after each step."""
+"""A diffrax solver that puts the state back on the closed loops after each step."""
 
 import dataclasses
 from typing import ClassVar
@@ -23,7 +23,7 @@ BEYOND = 1.5  # how far after its end a step may leave a passage, in steps
 
 
 def retry_factors(nodes) -> np.ndarray:
-    """By how much to change a step that meets an event at one of its nodes.
+    """The factors by which to change a step that meets an event at one of its nodes.
 
     For each node of a Runge-Kutta tableau in (0, 1] the factor that brings the event as far from
     all nodes as possible, into the middle of a gap between later ones or after the step's end.
@@ -40,7 +40,7 @@ def retry_factors(nodes) -> np.ndarray:
 
 
 class StageNorm(eqx.Module):
-    """The size of a change of the rates at a stage: what it changes of the state, relative to the tolerances."""
+    """The size of a change of the rates at a stage: its effect on the state, relative to the tolerances."""
 
     problem: Problem
     y0: Float[Array, " n"]
@@ -56,13 +56,13 @@ class StageNorm(eqx.Module):
 
 
 class Chord(diffrax.VeryChord):
-    """diffrax's root finder for implicit steps, which goes on for as long as it converges.
+    """diffrax's root finder for implicit steps, going on for as long as it converges.
 
     Up to version 0.7.2 diffrax's takes a step for failed where two iterations do not suffice.
     """
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Whether what the iterations to come would still change is below kappa, or they diverge."""
+        """Stop where what later iterations would still change is below kappa, or where they diverge."""
         rate, at_least_two = state.diffsize / state.diffsize_prev, state.step >= 2
         contracts = at_least_two & (rate < 1.0)
         to_come = state.diffsize * jnp.where(contracts, rate / jnp.where(contracts, 1.0 - rate, 1.0), 1.0)
@@ -76,13 +76,14 @@ class Chord(diffrax.VeryChord):
 
 
 class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
-    """Any diffrax solver, with the state put back on the closed loops after each step.
+    """Wrap any diffrax solver: it puts the state back on the closed loops after each step.
 
     The estimate of the step's error is put there too: only its part in the tangent space remains
     in the state. The rest is mostly rounding, which a singular configuration amplifies and the
     correction removes; a step control that saw it would stall.
 
-    `is_final`: no transformation will differentiate its steps, so that each may be one kernel.
+    - `after_step`: whether to correct. `is_undifferentiated`: no transformation will differentiate its steps, so that
+      each may be one kernel.
 
     Not an `AbstractWrappedSolver`: diffrax would look through it for fields it does not have.
     """
@@ -98,8 +99,8 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
     def around(solver, accuracy, adjoint, control: MechanismControl) -> "ProjectedSolver":
         """Wrap a solver.
 
-        What diffrax hands to a solver only where it sees it, it gets here: the kind of loop inside Runge-Kutta
-        steps that forward mode needs, and the tolerances for the root finder of an implicit one.
+        diffrax hands a solver two things only where it sees it, so it gets them here: the kind of loop inside
+        Runge-Kutta steps that forward mode needs, and the tolerances for the root finder of an implicit one.
         """
         kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
         if kind and getattr(solver, "scan_kind", kind) is None:
@@ -111,7 +112,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         return ProjectedSolver(solver, tolerances, accuracy.projection in ("both", "step"), control.is_undifferentiated)
 
     def _stepping(self, problem, y0, duration):
-        """The solver for one step: its root finder measures what it finds as errors of the step are measured."""
+        """The solver for one step: its root finder measures iterates as errors of the step are measured."""
         if self.tolerances is None:
             return self.solver
         finder = self.solver.root_finder
@@ -146,7 +147,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         sound=lambda self, terms, t0, t1, y0, *_: jnp.all(jnp.isfinite(y0)),
     )
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step of the solver inside, and the correction after it: error and solver's state are linkax's own."""
+        """Take a step with the solver inside and correct it; error and solver's state are those of `diffrax_contract`."""
         # Solvers that begin with the last derivative of the step before must not where the state has moved since.
         switching = len(args.sides(y0)) > 0
         made_jump = True if switching or (self.after_step and args.method.moves_after_steps) else made_jump
@@ -175,5 +176,5 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         return y1, StepError(error, leaves, passes, retry, switch), dense_info, state, result
 
     def corrected(self, problem: Problem, t1, y1, sides):
-        """The state that a step leaves, on these sides of switches."""
+        """Correct the state after a step, and put it on these sides of switches."""
         return crossed(problem, t1, problem.corrected(t1, y1)[0] if self.after_step else y1, sides)

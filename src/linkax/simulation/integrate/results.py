@@ -1,4 +1,4 @@
-"""How a simulation ended."""
+"""How a run ended, in names and words; its errors and warnings."""
 
 import diffrax
 import equinox as eqx
@@ -76,7 +76,7 @@ def remark_name(remark) -> str:
 
 
 class REMARKS(eqx.Enumeration):
-    """What there is to say of a simulation that ended well: of the first that applies a single run warns."""
+    """Remarks on a run that ended well; a single run warns of the first that applies."""
 
     none = ""
     rounding = (
@@ -98,11 +98,11 @@ class REMARKS(eqx.Enumeration):
 
 
 class AccuracyWarning(UserWarning):
-    """A simulation that rounding keeps from the tolerance asked for; `Solution.error_estimate` tells how far."""
+    """Rounding keeps a run from the tolerance asked for; `Solution.error_estimate` tells how far."""
 
 
 class StiffnessWarning(UserWarning):
-    """A simulation whose steps one fast element chooses, and not the motion."""
+    """One fast element, and not the motion, chooses the steps of a run."""
 
 
 WARNINGS = {
@@ -114,7 +114,7 @@ WARNINGS = {
 
 
 class SimulationError(RuntimeError):
-    """A simulation that did not reach its end; `solution` holds the part computed."""
+    """A run did not reach its end; `solution` holds the part computed."""
 
     def __init__(self, message, solution=None):  # the message alone is what pickle gives, the rest follows
         super().__init__(message)

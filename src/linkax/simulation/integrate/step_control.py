@@ -1,4 +1,4 @@
-"""Any diffrax step size controller, for motion on a manifold with singular configurations and switches."""
+"""A diffrax step size controller for motion on a manifold with singular configurations and switches."""
 
 import diffrax
 import equinox as eqx
@@ -21,20 +21,20 @@ FEASIBLE = 0.1  # of a step's first distance: what any step can keep from a pass
 
 
 class MechanismControl(diffrax.AbstractStepSizeController):
-    """Any diffrax step size controller, measuring errors in the units of the mechanism.
+    """Wrap any diffrax step size controller: it measures errors in the scales of the mechanism.
 
     The controller inside sees coordinates in radians and lengths of the mechanism, all of
-    magnitude one, and speeds in the same units, all of the magnitude of the largest: a joint
+    magnitude one, and speeds in the same scales, all of the magnitude of the largest: a joint
     that has made many turns, or that stands still for a moment, does not change the tolerance.
     The error it sees has rounding taken off, which no smaller step would lower, and which grows
     near a singular configuration.
 
-    An adaptive step that has a stage close to a singular configuration is tried again, shorter,
-    so that the configuration falls between two stages. Where a few tries do not help, or the step
-    begins in the singular configuration, it is left as it is. One that goes past a switch of a force element is tried
-    again up to there, see `linkax.simulation.integrate.switches`.
+    An adaptive step with a stage close to a singular configuration is tried again, shorter, so that the configuration
+    falls between two stages. Where a few tries do not help, or the step begins in the singular configuration, it is
+    left as it is. A step that goes past a switch of a force element is tried again up to there, see
+    `linkax.simulation.integrate.switches`.
 
-    `is_final`: see `Projected`.
+    - `is_undifferentiated`: see `ProjectedSolver`.
     """
 
     controller: diffrax.AbstractStepSizeController
@@ -49,13 +49,13 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         return isinstance(self.innermost, diffrax.AbstractAdaptiveStepSizeController)
 
     def tolerances(self, otherwise):
-        """Relative and absolute tolerance of the controller inside; others where it has none."""
+        """Relative and absolute tolerance of the controller inside; `otherwise` where it has none."""
         inner = self.innermost
         return (inner.rtol, inner.atol) if self.is_adaptive else otherwise
 
     @property
     def innermost(self) -> diffrax.AbstractStepSizeController:
-        """The controller inside others that hold one."""
+        """The controller inside all wrappers."""
         inner = self.controller
         while hasattr(inner, "controller"):
             inner = inner.controller
@@ -74,7 +74,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
 
     @in_one_kernel(when=lambda self, *_: self.is_undifferentiated, sound=lambda self, t0, *_: jnp.isfinite(t0))
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Keep the step or not, and choose the next one; `y_error` is a `StepError`."""
+        """Accept or reject the step, and choose the next one; `y_error` is a `StepError`."""
         scales = args.system.scales
         magnitudes = tuple(_magnitudes(args, y) for y in (y0, y1_candidate))
         scaled = None
@@ -120,20 +120,20 @@ class MechanismControl(diffrax.AbstractStepSizeController):
 
 
 def _magnitudes(problem, y):
-    """What the tolerances are relative to: one for coordinates, the largest speed for speeds."""
+    """The magnitudes that tolerances are relative to: one for coordinates, the largest speed for speeds."""
     q, v = problem.unpacked(y)
     fastest = jnp.broadcast_to(problem.system.fastest(v), v.shape)
     return jnp.where(jnp.all(jnp.isfinite(q)), jnp.ones_like(v), jnp.nan), fastest
 
 
 def _noise(distance, nearest):
-    """Rounding along the motion, relative: it grows like 1/d, up to 1/`nearest`.
+    """Relative rounding along the motion: it grows like 1/d, up to 1/`nearest`.
 
-    Across the motion it grows like 1/d², but that the correction takes off.
+    Across the motion it grows like 1/d², but the correction takes that off.
     """
     return NOISE_ULPS * jnp.finfo(distance.dtype).eps / jnp.maximum(distance, nearest)
 
 
 def _less(error, noise):
-    """An error less the noise in it."""
+    """Take the noise off an error."""
     return jnp.where(jnp.abs(error) > noise, error - jnp.sign(error) * noise, 0.0 * error)

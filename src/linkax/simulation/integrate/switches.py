@@ -1,4 +1,4 @@
-"""Switches of force elements: which side of each a motion is on, and where steps are to end.
+"""Switches of force elements: the side of each that a motion is on, and steps that end at them.
 
 Each step is computed with all force elements held on the sides on which it begins, so that nothing in it has a kink.
 A step that goes past a switch is tried again, up to there, and the next begins on the other side.
@@ -34,7 +34,7 @@ class Held(eqx.Module):
 
 
 def held(system, sides):
-    """A system with its force elements held on the given sides of their switches, (m,), 1 or −1."""
+    """Hold the force elements of a system on the given sides of their switches, (m,), 1 or −1."""
     sides = iter(sides)
     forces = tuple(Held(force, next(sides)) if has_switch(force) else force for force in system.forces)
     return dataclasses.replace(system, forces=forces)
@@ -47,16 +47,18 @@ def values(system, t, q, v):
 
 
 def start_sides(system, t, q, v):
-    """The sides of switches, (m,), 1 or −1, that a state is on; () where there are none."""
+    """The sides of switches, (m,), 1 or −1, at a state; () without switches."""
     if not any(map(has_switch, system.forces)):
         return ()
     return jnp.where(values(system, t, q, v) > 0.0, 1.0, -1.0).astype(q.dtype)
 
 
 def meet(problem, t0, t1, y0, y1, within):
-    """The share of a step up to the first switch that it goes past, one for none; sides after a step that has none.
+    """Find where a step goes past a switch, and on which sides it ends.
 
-    `within(t)`: what interpolates in the step.
+    **Arguments:** `within(t)`: interpolates in the step.
+
+    **Returns:** the share of the step up to the first switch, one for none; the sides after a step that goes past none.
     """
     sides, on = problem.sides(y0), ON_ULPS * jnp.finfo(y0.dtype).eps
     duration = t1 - t0
@@ -89,11 +91,11 @@ def meet(problem, t0, t1, y0, y1, within):
 
 
 def crossed(problem, t, y, sides):
-    """A state on the sides of switches that it goes over to, with the derivative of when it does.
+    """Put a state on the sides of switches that it goes over to, with the derivative of when it does.
 
-    Where forces jump, a change of the time changes the motion after it: (f₋ − f₊) dt, of which dt = −dg / ġ for a
+    Where forces jump, a later crossing changes the motion after it: (f₋ − f₊) dt, with dt = −dg / ġ for a
     switch g (the saltation matrix; Leine and Nijmeijer (2004), Dynamics and Bifurcations of Non-Smooth Mechanical
-    Systems, ch. 7). Forces that have a kink alone do not jump.
+    Systems, ch. 7). Forces with a kink alone do not jump.
     """
     before = problem.sides(y)
     if not len(before):

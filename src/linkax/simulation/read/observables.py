@@ -1,4 +1,4 @@
-"""What can be read from one instant of a motion; `linkax.Solution` reads it at all its times."""
+"""What can be read from a motion at one time; `linkax.Solution` reads it at all its times."""
 
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ class Violation(NamedTuple):
     """Largest violation of the loop rows, at each time or over the run.
 
     - `position`: c, rotation rows [rad], translation rows in lengths of the loop.
-    - `velocity`: J v [1/s]. `acceleration`: J v̇ − γ [1/s²].
+    - `velocity`: J v − b [1/s]. `acceleration`: J v̇ − γ [1/s²].
     """
 
     position: Float[Array, "..."]
@@ -35,17 +35,17 @@ class Violation(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Where a body's reference frame is: its origin [m], (..., 3), and its axes as columns, (..., 3, 3)."""
+    """Pose of a body's reference frame: origin [m], (..., 3), and axes as columns, (..., 3, 3)."""
 
     origin: Float[Array, "... 3"]
     axes: Float[Array, "... 3 3"]
 
 
 class Power(NamedTuple):
-    """What raises kinetic plus potential energy [W].
+    """The rate of kinetic plus potential energy, by its causes [W].
 
-    - `forces`: of force elements, beyond the fall of their potential energy; damping counts as negative.
-    - `drives`: of constraints that change with time: drives, winches, cylinders.
+    - `forces`: force elements, beyond the fall of their potential energy; damping counts as negative.
+    - `drives`: constraints that change with time: drives, winches, cylinders.
     """
 
     forces: Float[Array, "..."]
@@ -53,9 +53,10 @@ class Power(NamedTuple):
 
 
 class Observables(NamedTuple):
-    """One saved time of a solution: found by `method`, split into normal and tangent space by `tangent_space`.
+    """The state at one time, and what follows from it.
 
-    - `dynamics`: what `solve` finds, for the functions that need accelerations or multipliers.
+    - `method`: the formulation that moved it. `tangent_space`: splits into normal and tangent space.
+    - `dynamics`: what `solve` returns, for functions that need accelerations or multipliers.
     """
 
     system: System
@@ -93,13 +94,13 @@ class Observables(NamedTuple):
         return linear[body] + cross(angular[body], arm) + cross(omega, cross(omega, arm))
 
     def center_of_mass(self, function, bodies):
-        """What `position`, `velocity` or `acceleration` say of the centre of mass of several bodies."""
+        """Apply `position`, `velocity` or `acceleration` to the common centre of mass of several bodies."""
         of_bodies = function(self, bodies, jnp.zeros(3, self.q.dtype))
         mass = self.system.mass[bodies]
         return mass @ of_bodies / jnp.sum(mass)
 
     def on_beam(self, function, beam, point):
-        """The same of a point fixed to the section of a beam at point[0]."""
+        """Apply the same to a point fixed to the section of a beam at point[0]."""
         place = lambda t, q: beam_point(configure(self.system, t, q), beam, point)
         if function is Observables.position:
             return place(self.t, self.q)
@@ -134,7 +135,7 @@ class Observables(NamedTuple):
         return least_multipliers(rows, multipliers, scales, tolerance, self.rank())
 
     def _multipliers(self):
-        """Of minimum norm; of the paper's method, close to a singular configuration, as a limit along the motion."""
+        """λ of minimum norm; of the paper's method, close to a singular configuration, as a limit along the motion."""
         if isinstance(self.method, TangentSpace) and self.system.topology.num_rows:
             return self.method.least_multipliers(self.system, self.t, self.q, self.v)
         return self._least_multipliers().multipliers
@@ -147,7 +148,7 @@ class Observables(NamedTuple):
         return sorted_multipliers(self.configuration, self._multipliers()).constraints
 
     def _self_stresses(self):
-        """Multipliers with Jᵀλ = 0, a row each: those of rows that motion changes, and of rows that none does."""
+        """Multipliers with Jᵀλ = 0, a row each: of rows that motion can change, and of rows that none can."""
         topology = self.system.topology
         immobile = topology.num_immobile_rows
         free = self._least_multipliers().free.T

@@ -35,9 +35,9 @@ class Passages(NamedTuple):
     - `times`: (n,), rising.
     - `digits`: decimal digits of the state that the run lost to them: rounding errors of the
       tangential motion grow like 1/d at the stages of steps, d the distance from a singular
-      configuration, and add up over the passages. Not a number for a classical formulation.
-    - `accuracy`: what the search may have missed `times` by [s], or not a number without passages. The motion itself is
-      off by as much as `Solution.error_estimate` tells.
+      configuration, and add up over the passages. NaN for a classical formulation.
+    - `accuracy`: the largest error of `times` [s], NaN without passages. The motion itself is off by as much as
+      `Solution.error_estimate` tells.
     """
 
     times: np.ndarray
@@ -63,13 +63,13 @@ class Samples(NamedTuple):
         return Samples(*(part[which] for part in self))
 
     def then(self, other: "Samples") -> "Samples":
-        """Both, where the other begins with the last state of this one."""
+        """Join samples of which the second begin with the last state of the first."""
         return Samples(*(np.concatenate([part, more[1:]]) for part, more in zip(self, other, strict=True)))
 
     def missed(self, system) -> np.ndarray:
-        """By how much time a cubic polynomial may miss the motion in each interval [s], (n - 1,).
+        """The largest error of a cubic polynomial in each interval, as a time [s], (n - 1,).
 
-        The one over two intervals misses the state in their middle by sixteen times as much.
+        The polynomial over two intervals misses the state in their middle by sixteen times as much.
         """
         t, missed = self.ts, np.full(len(self.ts), np.inf)
         places = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
@@ -88,7 +88,7 @@ class Samples(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """A passage: its time, the coordinates there, and what the search may have missed the time by."""
+    """A passage: its time, the coordinates there, and the error of the time."""
 
     time: float
     q: np.ndarray
@@ -96,7 +96,7 @@ class _Found(NamedTuple):
 
 
 def passages(solution) -> Passages:
-    """Passages of one `linkax.Solution`, not of a batch.
+    """Find the passages of one `linkax.Solution`.
 
     **Raises:** `ValueError` for a batch, or where the solution saved functions of its own.
     """
@@ -110,17 +110,18 @@ def passages(solution) -> Passages:
 
 
 def singular_states(solution):
-    """Times at which a motion goes through singular configurations, (n,), and the coordinates there, (n, n_q)."""
+    """Find the times of passages, (n,), and the coordinates there, (n, n_q)."""
     found = _passages(solution)
     states = np.array([passage.q for passage in found]).reshape(len(found), solution.q.shape[-1])
     return np.array([passage.time for passage in found]), states
 
 
 def _passages(solution) -> list[_Found]:
-    """All passages, in order.
+    """Find all passages, in order.
 
-    J at one state times the right inverse of J at the one before has eigenvalues near one; one that is negative has
-    passed through zero between. It is sought on a polynomial first, and then on the motion, run again from there.
+    J at one state times the right inverse of J at the one before has eigenvalues near one; an eigenvalue that is
+    negative has passed through zero between the two. Its zero is sought on a polynomial first, then on the motion, run
+    again.
     """
     if solution.ts.ndim != 1:
         raise ValueError(f"passages of a batch of shape {solution.ts.shape[:-1]}; ask for one member at a time")
@@ -151,13 +152,13 @@ def _passages(solution) -> list[_Found]:
 
 
 def _apart(times, together):
-    """The first of each times that lie together, in order."""
+    """Indices of the first of times that lie together, in order."""
     order = np.argsort(times)
     return order[np.diff(times[order], prepend=-np.inf) > together]
 
 
 def _close_enough(solution) -> Samples:
-    """As many states as the run took steps: where fewer were saved, it is run again, part by part."""
+    """Take as many states as the run took steps: where fewer were saved, run it again, part by part."""
     samples, steps = Samples.of(solution), int(solution.stats.get("num_accepted_steps", 0))
     if steps < len(samples.ts) or not has_parts(solution):
         return samples
@@ -174,7 +175,7 @@ def _close_enough(solution) -> Samples:
 
 
 def _candidates(solution, samples):
-    """The intervals in which distances may have fallen to zero, as far as the joints move in them."""
+    """Indices of intervals in which distances may fall to zero, given how far the joints move in them."""
     scales = np.asarray(system_of(solution.mechanism, solution.q.dtype).scales)
     fastest = np.max(np.abs(samples.v / scales), axis=1)
     travelled = np.maximum(fastest[1:], fastest[:-1]) * np.diff(samples.ts)
@@ -183,7 +184,7 @@ def _candidates(solution, samples):
 
 
 def _polished(solution, pair, time, q) -> _Found:
-    """A passage between two states, at the time and coordinates that a polynomial says, as the motion has it."""
+    """Find a passage between two states on the motion, from the time and coordinates that a polynomial says."""
     begin, accuracy = pair.ts[0], pair.ts[1] - pair.ts[0]
     if not has_parts(solution):
         return _Found(float(time), q, float(accuracy))
@@ -203,13 +204,13 @@ def _polished(solution, pair, time, q) -> _Found:
 
 
 class _Change(NamedTuple):
-    """J at a state times its right inverse G at one before, and J G there, which projects on the independent rows."""
+    """J at a state times its right inverse G at an earlier one, and J G there, which projects on the independent rows."""
 
     change: np.ndarray
     projector: np.ndarray
 
     def eigenvalues(self):
-        """On the independent rows; ones where a motion that diverged has left no numbers."""
+        """Eigenvalues on the independent rows; ones where a motion that diverged has left no numbers."""
         if not np.all(np.isfinite(self.change)):
             return np.ones(len(self.change))
         basis, _, _ = np.linalg.svd(self.projector)
@@ -217,7 +218,7 @@ class _Change(NamedTuple):
         return np.linalg.eigvals(basis.T @ self.change @ basis)
 
     def turned(self):
-        """The eigenvalues that have become negative; of those that are the same, of loops that move alike, one."""
+        """The eigenvalues that have become negative; equal ones, of loops that move alike, once."""
         off = np.abs(self.change - self.projector)
         if np.max(np.sum(off, axis=0), initial=0.0) * np.max(np.sum(off, axis=1), initial=0.0) < 1.0:
             return np.empty(0)  # as the norm of what the eigenvalues differ from one by is below one
@@ -226,13 +227,13 @@ class _Change(NamedTuple):
         return turned[np.diff(turned, prepend=-np.inf) > ALIKE * np.abs(turned)]
 
     def smallest(self):
-        """The eigenvalue next to zero."""
+        """The eigenvalue nearest to zero."""
         values = self.eigenvalues()
         return values[np.argmin(np.abs(values))].real
 
 
 def _zeros(solution, pairs, ends):
-    """Where between two states the eigenvalues are zero that end at `ends`, d and the coordinates there."""
+    """Find where between two states eigenvalues that end at `ends` are zero, with d and the coordinates there."""
     low, high = (np.zeros(len(ends)), np.ones(len(ends))), (np.ones(len(ends)), ends)
     places, distances = low
     states = np.zeros((len(ends), solution.q.shape[-1]))
@@ -247,7 +248,7 @@ def _zeros(solution, pairs, ends):
 
 
 def _between(solution, pairs, places):
-    """Changes of J (see `_passages`), distances and coordinates, at places from 0 to 1 between two states."""
+    """Changes of J (see `_passages`), d and coordinates, at shares from 0 to 1 between two states."""
     changes, distances, states = [], [np.zeros(0)], [np.zeros((0, solution.q.shape[-1]))]
     for first in range(0, len(places), BATCH):
         taken = np.arange(first, min(first + BATCH, len(places)))
@@ -261,7 +262,7 @@ def _between(solution, pairs, places):
 
 
 def _on_cubic(system, ts, qs, vs, place):
-    """Coordinates at a place from 0 to 1 between two states, by their cubic polynomial."""
+    """Interpolate coordinates between two states by their cubic polynomial, at a share from 0 to 1."""
     duration, dtype = ts[1] - ts[0], qs.dtype
     hermite = ThirdOrderHermitePolynomialInterpolation(
         t0=jnp.zeros((), dtype),
@@ -276,7 +277,7 @@ def _on_cubic(system, ts, qs, vs, place):
 
 @quick_compile
 def between_states(mechanism, tangent_space, rank_nearby, ts, qs, vs, places):
-    """J at places between two states, times its right inverse G at the first; J G there; d and q at the places.
+    """J at shares between two states times its right inverse G at the first; J G there; d and q at the shares.
 
     All with a leading axis.
     """

@@ -30,7 +30,7 @@ from linkax.xla.tracing import all_concrete, quick_compile
 
 
 class AssemblyError(ValueError):
-    """The loops of a mechanism cannot be closed at the positions that were asked for."""
+    """No positions close the loops of a mechanism with those asked for."""
 
 
 class AssemblyWarning(UserWarning):
@@ -38,7 +38,7 @@ class AssemblyWarning(UserWarning):
 
 
 def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t=0.0) -> State:
-    """A state with closed loops, from coordinates and speeds of some of the joints.
+    """Find a state on the closed loops, from coordinates and speeds of some of the joints.
 
     **Arguments:**
 
@@ -48,19 +48,18 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     - `speeds`: {joint: speeds [rad/s or m/s]}, likewise; held.
     - `guess`: {joint: coordinates} of joints in the tree, where the search starts (default:
       frames that coincide); chooses the assembly mode.
-    - `t`: time [s], which matters to drives.
+    - `t`: time [s], for drives.
 
-    Coordinates that are not held change as little as the loops allow from the guess, and
-    speeds that are not held are the smallest that the loops allow, both measured in radians
-    and in lengths of the mechanism. Where the search does not get from the guess to closed loops,
-    it starts again beside it, a little and then farther. Strains of beams stay as guessed, by default
-    zero; where no start leads to closed loops so, they change, with little energy. In a singular
-    configuration, where branches of the motion cross, speeds lie on that of the position where it is a little off
-    (1e-9), else on the branch nearest to these; give more of them to choose another.
+    Coordinates that are not held change as little as the loops allow from the guess, and speeds that are not held are
+    the smallest that the loops allow, both in radians and lengths of the mechanism. Where the search does not reach
+    closed loops from the guess, it starts again beside it, a little and then farther. Strains of beams stay as guessed,
+    by default zero; where no start closes the loops so, they change, with little energy. In a singular configuration,
+    where branches of the motion cross, speeds lie on the branch of the position where it is a little off (1e-9), else
+    on the branch nearest to these; give more of them to choose another.
 
-    Derivatives by numbers of the mechanism, positions and speeds given, and the guess, to any order: of
-    coordinates that are not held and that the loops leave free, those of the nearest to the guess, as if
-    it closed the loops.
+    Differentiable in the numbers of the mechanism, positions, speeds and the guess, to any order. A coordinate that is
+    neither held nor decided by the loops has the derivative of the nearest to the guess, as if the guess closed the
+    loops.
 
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
@@ -103,7 +102,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
 
 
 def _open_speeds(mechanism, speeds, t, state):
-    """Names of joints that move otherwise on other branches with the speeds asked."""
+    """Names of joints whose speeds differ on other branches that have the speeds asked."""
     others, are_some = other_speeds(mechanism, speeds, t, state.q, state.v)
     differences = (others - state.v)[np.asarray(are_some)].T
     names = moving_joints(system_of(mechanism, state.q.dtype), t, state.q, differences) if differences.size else ()
@@ -147,7 +146,7 @@ def _raise_if_open(mechanism, state, t, remainder):
 
 
 class _Remainder(eqx.Module):
-    """What is left open, for the error message; and of each beam the largest change of a strain, and its energy."""
+    """What stays open, for the error message; of each beam the largest change of a strain, and its energy."""
 
     gap: Gap
     length: jax.Array
@@ -159,11 +158,11 @@ class _Remainder(eqx.Module):
 
     @property
     def most(self):
-        """What coordinates and speeds may miss."""
+        """The largest miss of coordinates and speeds that counts as none."""
         return CLOSED * jnp.maximum(self.length, 1.0)
 
     def is_met(self):
-        """Whether the loops are closed and all that is held is where it should be."""
+        """Whether the loops are closed and all that is held is met."""
         missed = [*self.positions.values, *self.speeds.values, self.gap.constraints]
         met = jnp.all(self.gap.distance <= CLOSED * self.length) & jnp.all(self.gap.angle <= CLOSED)
         return met & jnp.array([jnp.all(jnp.abs(miss) <= self.most) for miss in missed]).all()

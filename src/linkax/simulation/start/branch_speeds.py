@@ -1,4 +1,4 @@
-"""Speeds that the loops allow, with some held; in a singular configuration on a branch of the motion."""
+"""Speeds that the loops allow, with some of them held; in a singular configuration on a branch of the motion."""
 
 import equinox as eqx
 import jax
@@ -29,7 +29,7 @@ APART = 1e-3  # of the largest speed: what tells branches apart
 
 
 class _Asked(eqx.Module):
-    """Speeds that the loops and a user ask for, over `scale`: rows @ v is `right`, and v is on a branch."""
+    """The equations for speeds, over `scale`: rows @ v = right (loops, and speeds held), and v on a branch."""
 
     crossing: ConstraintSplit
     rows: jax.Array
@@ -37,7 +37,7 @@ class _Asked(eqx.Module):
     scale: jax.Array
 
     def rest(self, v):
-        """What speeds leave over."""
+        """The residual of the equations at speeds v."""
         return jnp.concatenate([self.right - self.rows @ v, -self.crossing.off_branch(v, self.scale)])
 
     @property
@@ -48,11 +48,11 @@ class _Asked(eqx.Module):
         return -jax.jacfwd(self.rest)(v)
 
     def next_to(self, v, tolerance=None):
-        """The nearest speeds that satisfy the rows, on a branch or not."""
+        """The speeds nearest to v that satisfy the rows, on a branch or not."""
         return nearest_solution(self.system, v, self.rows, self.right, tolerance)
 
     def missed(self, v):
-        """How far speeds are from those asked."""
+        """The largest miss of the rows."""
         return largest(self.right - self.rows @ v)
 
     def aside(self, count):
@@ -61,9 +61,10 @@ class _Asked(eqx.Module):
         return jax.vmap(self.next_to)(jnp.asarray(anywhere, self.right.dtype) * self.system.scales)
 
     def least(self):
-        """The smallest speeds, on a branch or not; close to a singular configuration on the branch of the position.
+        """The smallest speeds that satisfy the rows; close to a singular configuration those on the branch of the
+        position.
 
-        Also whether other branches may cross there, of which the position does not tell.
+        Also whether other branches may cross there, between which the position does not decide.
         """
         least, scales = self.next_to(jnp.zeros_like(self.system.scales)), self.system.scales
         within = self.next_to(jnp.zeros_like(scales), SEEN_ULPS * jnp.finfo(scales.dtype).eps)
@@ -74,7 +75,7 @@ class _Asked(eqx.Module):
         return jnp.where(told, within, least), moves & (off[1] > BESIDE) & jnp.logical_not(told_apart)
 
     def off_branch(self, v):
-        """How far speeds are from a branch, relative to themselves."""
+        """How far speeds are from a branch, over the square of the largest."""
         fastest = self.system.fastest(v)
         off = largest(self.crossing.off_branch(v, self.scale))
         return ratio(off, fastest**2, 0.0)
@@ -82,7 +83,7 @@ class _Asked(eqx.Module):
 
 @eqx.filter_custom_jvp
 def _on_branch(asked, v):
-    """Speeds on a branch, by Newton steps from a little beside speeds v, which may lie just between two."""
+    """Find speeds on a branch by Newton steps from a little beside v, which may lie just between two branches."""
     beside = BESIDE * jnp.sum(asked.crossing.inverse.basis, axis=1)
     off = asked.off_branch(v) > ON_BRANCH * rank_tolerance(v.dtype)
     turn = lambda _, v: v + nearest_solution(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
@@ -92,7 +93,7 @@ def _on_branch(asked, v):
 
 @_on_branch.def_jvp
 def _on_branch_jvp(primals, changes):
-    """Where nothing is left over, to any order: the Newton steps have no derivative."""
+    """Tangent by the implicit function theorem, to any order: the Newton steps have no derivative."""
     (asked, begin), (change, begins) = primals, changes
     v = _on_branch(asked, begin)
     opens = pushforward(lambda asked: asked.rest(v), (asked,), (change,))[1]
@@ -111,13 +112,13 @@ def _asked(configuration, held):
 
 
 def speeds_on_branch(configuration, held):
-    """The smallest speeds with those of joints held, or near to them on a branch of the motion.
+    """Find the smallest speeds with those of some joints held, or, near them, speeds on a branch of the motion.
 
     Speeds satisfy J v = b, and γ(v, v) is in the range of J; where the rank of J is constant, the
     smallest do.
 
     **Returns:** speeds, (n_v,); how far the smallest speeds that the loops allow are from those held, by
-    joint; how far the speeds are from such a branch, relative to themselves; and whether there may be others.
+    joint; how far the speeds are from a branch, relative to themselves; whether there may be other branches.
     """
     asked = _asked(configuration, held)
     crossing, scale = asked.crossing, asked.scale
@@ -132,7 +133,7 @@ def speeds_on_branch(configuration, held):
 
 @quick_compile
 def other_speeds(mechanism, held, t, q, v):
-    """Speeds on other branches than v, with those of joints held: candidates, (k, n_v), and which of them are some."""
+    """Speeds on other branches than v, with those of joints held: candidates, (k, n_v), and which of them are valid."""
     configuration = configure(system_of(mechanism, q.dtype), t, q)
     asked = _asked(configuration, held)
     tolerance = rank_tolerance(q.dtype)

@@ -31,14 +31,14 @@ STRAINED = np.array([[0.0, 1e-2, 1e-2, 0.0, 1e-2, 1e-2], [0.1, 0.1, 0.1, 0.0, 0.
 
 
 class LoopClosure(eqx.Module):
-    """Closed loops at time t, and coordinates of joints that are held at values."""
+    """The problem of closing the loops at time t, with coordinates of some joints held at values."""
 
     system: System
     t: jax.Array
     held: JointValues
 
     def misses(self, configuration):
-        """How far what is held is from where it should be, one number for each speed."""
+        """How far joints are from where they are held, one number for each speed, by joint."""
         topology, apart = self.system.topology, []
         for along, entry in zip(self.held.terms, self.held.values, strict=True):
             kind = topology.joint_types[topology.joints.index(along.joint)]
@@ -55,11 +55,11 @@ class LoopClosure(eqx.Module):
         return tuple(apart)
 
     def rows(self, configuration):
-        """All that must vanish: loop rows, axes that point apart, misses."""
+        """All residuals: loop rows, flipped axes, misses."""
         return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(configuration)])
 
     def linearised(self, q):
-        """The rows, and their derivative where the loops are closed; elsewhere the direction that closes them."""
+        """The residuals and their derivative where the loops are closed; elsewhere the direction that closes them."""
         configuration, held = configure(self.system, self.t, q), ()
         if self.held.terms:
             moved = lambda change: configure(self.system, self.t, retract(self.system.topology, q, change))
@@ -69,13 +69,15 @@ class LoopClosure(eqx.Module):
         return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], *held])
 
     def back(self, q, guess):
-        """The change that undoes that of the strains since a guess."""
+        """The change that undoes the change of strains since a guess."""
         change = speeds(self.system.topology, q, guess - q)
         strains = strains_of(self.system)
         return scatter_static(jnp.zeros_like(change), strains, change[strains])
 
     def metrics(self):
-        """In radians and lengths of the mechanism, with strains by energy, over that of the softest or the hardest."""
+        """Two metrics, in radians and lengths, with strains by energy, over that of the softest or of the hardest
+        strain.
+        """
         strains, scales = strains_of(self.system), self.system.scales
         energy = elastic_energy(self.system)
         sizes = jnp.diagonal(energy) * scales[strains] ** 2
@@ -83,7 +85,7 @@ class LoopClosure(eqx.Module):
         return jax.vmap(of)(jnp.stack([jnp.min(sizes), jnp.max(sizes)]))
 
     def descent(self, rows, slopes):
-        """The steepest descent of the rows' squares, without strains, as long as their linearisation says."""
+        """The steepest descent of the squared residuals, without strains, as long as their linearisation says."""
         strains = strains_of(self.system)
         downhill = scatter_static(
             -(self.system.scales**2) * (rows @ slopes), strains, jnp.zeros(len(strains), rows.dtype)
@@ -93,12 +95,12 @@ class LoopClosure(eqx.Module):
         return downhill * ratio(-(rows @ change), scale, 0.0)
 
     def meet(self, q, guess, moves, weight):
-        """Damped Newton steps from q until rows and strains vanish or stop falling; descent where those fail.
+        """Take damped Newton steps from q until residuals and strains vanish or stop falling; descend where those fail.
 
         **Arguments:** `guess`: coordinates whose strains they lead back to; `moves`: which coordinates they change;
-        `weight`: of strains in radians and lengths of the mechanism, next to the rows.
+        `weight`: of strains in radians and lengths of the mechanism, next to the residuals.
 
-        **Returns:** where they lead, and the size of the rows there.
+        **Returns:** the coordinates reached, and the size of the residuals there.
         """
         metrics = self.metrics() if len(strains_of(self.system)) else None
 
@@ -135,7 +137,7 @@ class LoopClosure(eqx.Module):
         return while_falling(improve, (q, jnp.asarray(jnp.inf, q.dtype)), MOST_STEPS, SMALL, q.dtype)
 
     def search(self, q):
-        """Coordinates that meet the demand, from q, or else from beside it; the nearest miss where none do."""
+        """Find coordinates that close the loops, from q, or else from beside it; those nearest to it where none do."""
         fixed = np.isin(np.arange(self.system.topology.num_speeds), strains_of(self.system))
         # Beams are strained only where that leads to no closed loops, by what the nearest miss leaves open.
         sizes, weights = np.concatenate(
@@ -166,13 +168,13 @@ def _size(rows):
 
 @eqx.filter_custom_jvp
 def close_loops(demand, q):
-    """Coordinates that meet a demand, by a search from q."""
+    """Find coordinates that close the loops, by a search from q."""
     return demand.search(q)
 
 
 @close_loops.def_jvp
 def _closed_jvp(primals, changes):
-    """Where the rows stay zero, nearest to the change of where the search begins; itself it has no derivative."""
+    """Tangent by the implicit function theorem, nearest to that of where the search begins; the search has none."""
     (demand, begin), (change, begins) = primals, changes
     q, topology = close_loops(demand, begin), demand.system.topology
     along = jnp.zeros_like(demand.system.scales) if begins is None else speeds(topology, begin, begins)

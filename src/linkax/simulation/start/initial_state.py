@@ -1,4 +1,4 @@
-"""What a state is, before motion starts from it: closed, on a branch of the motion, unique."""
+"""The check of a state before motion starts: closed, on a branch of the motion, unique."""
 
 from typing import NamedTuple
 
@@ -23,13 +23,13 @@ ON_BRANCH = 10.0  # rank tolerances that speeds may be off a branch, relative to
 
 
 class InitialCheck(NamedTuple):
-    """A state that motion starts from at time t [s], put on the closed loops.
+    """A state at time t [s], put on the closed loops, and what a run needs to know of it.
 
-    - `singular`: the rank of J is smaller here than next to here.
-    - `rank`: of J at the states next to it along the motion, for each island of the mechanism, or each cell of its
-      chain where it has one.
+    - `singular`: the rank of J is smaller here than beside here.
+    - `rank`: of J at the states beside it along the motion, for each island of the mechanism, or each front of its
+      elimination plan where it has one.
     - `definiteness`: of the mass matrix on the tangent space, see `linkax.linalg.constrained_solve.SaddleInverse`.
-    - `assembled`: not marked by `linkax.assemble`, by infinite speeds, as a state that it did not find.
+    - `assembled`: False for a state that `linkax.assemble` did not find, which it marks by infinite speeds.
     - `finite`, `closed`; `massive`: all that can move has mass; `on_branch`: the speeds lie on a
       branch of the motion; `unique`: so does, at rest, the acceleration.
     """
@@ -48,19 +48,19 @@ class InitialCheck(NamedTuple):
 
     @property
     def can_start(self) -> Bool[Array, ""]:
-        """Motion can start from here."""
+        """Whether motion can start from here."""
         return self.finite & self.massive & self.closed & self.on_branch & self.unique
 
     def of_numbers(self, sound) -> "InitialCheck":
-        """The same of a mechanism whose numbers are sound or not, which then is what is wrong."""
+        """Note whether the numbers of the mechanism are sound: what is wrong then."""
         return self._replace(finite=self.finite & sound, assembled=self.assembled | jnp.logical_not(sound))
 
 
 def check_initial_state(method: TangentSpace, system: System, t, state: State) -> InitialCheck:
-    """Close a state and find the rank around it.
+    """Close a state and find the rank of J beside it along the motion.
 
-    At rest the motion departs along the acceleration. In a singular configuration that is free
-    to take any direction that J leaves; on a branch only if the loops have no force that turns it.
+    At rest the motion departs along the acceleration. In a singular configuration that may take any direction that J
+    leaves; it lies on a branch only if no force of the loops turns it.
     """
     q, v = method.close(system, t, state.q, state.v)
     start, begins = State(q, v), lax.stop_gradient(t)

@@ -1,4 +1,4 @@
-"""Least changes of coordinates and speeds, in which beams are strained as little as can be."""
+"""Least changes of coordinates and speeds that satisfy linear equations, with beams strained as little as possible."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from linkax.xla.static_scatter import scatter_static
 
 
 def rank_tolerance(dtype):
-    """For independent rows, of everything that is assembled."""
+    """τ of everything that is assembled."""
     return TangentSpace().prepared(dtype).rank_tolerance
 
 
@@ -22,21 +22,22 @@ def beams_of(system):
 
 
 def strains_of(system):
-    """Where the strains of beams are among the speeds."""
+    """Indices of the strains of beams among the speeds."""
     taken = [system.topology.speeds[beam.beam] for beam in beams_of(system)]
     return np.concatenate([np.zeros(0, int), *(np.arange(of.start, of.stop) for of in taken)])
 
 
 def elastic_energy(system):
-    """Twice that of the strains of beams, as a matrix."""
+    """The matrix of twice the energy of strains."""
     return block_diag(*(beam.matrix for beam in beams_of(system)))
 
 
 def nearest_solution(system, x, slopes, right, tolerance=None):
-    """What is nearest to x, in radians and lengths of the mechanism, with slopes @ x = right.
+    """Solve slopes @ y = right for the y nearest to x, in radians and lengths of the mechanism.
 
-    Strains of beams differ from x, by as little energy as they can, only in what all else leaves open. `tolerance`:
-    for independent rows, by default `rank_tolerance`.
+    Strains of beams differ from x only in what all else leaves open, by as little energy as they can.
+
+    **Arguments:** `tolerance`: for independent rows, by default `rank_tolerance`.
     """
     strains, scales = strains_of(system), system.scales
     if not len(strains):
@@ -51,7 +52,7 @@ def nearest_solution(system, x, slopes, right, tolerance=None):
 
 
 def nearest_solution_in(metric, scales, x, slopes, right, tolerance=None):
-    """What is nearest to x in a metric, or in units for None, with slopes @ x = right."""
+    """Solve slopes @ y = right for the y nearest to x in a metric; None: in scales."""
     tolerance = rank_tolerance(x.dtype) if tolerance is None else tolerance
     inverse = invert(metric, slopes, scales, tolerance)
     metric = jnp.diag(scales**-2) if metric is None else metric

@@ -9,7 +9,7 @@ class State(eqx.Module):
 
     - `q`: coordinates [rad or m], unit quaternions among them, (n_q,). `v`: speeds [rad/s or m/s], (n_v,).
 
-    `linkax.assemble` makes a consistent one from the joints' names.
+    `linkax.assemble` makes one on the closed loops from the joints' names.
     """
 
     q: Float[Array, " n_q"]

@@ -1,4 +1,4 @@
-"""What users give for a mechanism, checked: numbers for joints, states, times."""
+"""Checks of what users give for a mechanism: numbers for joints, states, times."""
 
 from collections.abc import Mapping
 from functools import reduce
@@ -20,7 +20,7 @@ from linkax.xla.tracing import concrete
 
 
 class JointValues(eqx.Module):
-    """Numbers that a user gives for joints.
+    """Numbers for joints.
 
     - `terms`: whose they are; one number for a term with an index, else all of the joint's.
     - `values`: as many arrays.
@@ -30,7 +30,7 @@ class JointValues(eqx.Module):
     values: tuple[jax.Array, ...]
 
     def speeds(self, motion) -> list[jax.Array]:
-        """The speeds of these joints in a motion, in the shapes of `values`."""
+        """Read the speeds of these joints in a motion, in the shapes of `values`."""
         of_joint = lambda along: motion.joint_speeds(along.joint)
         return [of_joint(along) if along.index is None else of_joint(along)[along.index][None] for along in self.terms]
 
@@ -40,7 +40,7 @@ def _is_law(node) -> bool:
 
 
 def check_mechanism(mechanism):
-    """Whether this is one mechanism, its functions are still the same, and JAX is in double precision."""
+    """Check that this is one mechanism, that its functions are unchanged, and that JAX is in double precision."""
     if not jax.config.jax_enable_x64:
         raise ValueError(
             "jax_enable_x64 is False, switched off after linkax was imported; switch it on again by "
@@ -65,9 +65,9 @@ def check_mechanism(mechanism):
 
 
 def sound_numbers(mechanism) -> Bool[Array, ""] | np.bool_:
-    """Whether no number of a mechanism that is or was traced is one that cannot be, see `linkax.model.numbers.require`.
+    """Whether all numbers of a mechanism that are or were traced are possible, see `linkax.model.numbers.require`.
 
-    What a user's own elements and functions hold is not looked at.
+    A user's own elements and functions are not looked at.
     """
     places = (mechanism.bodies, mechanism.beams, mechanism.joints, mechanism.forces, mechanism.constraints)
     own = [element for element in chain(*places) if type(element).__module__.startswith("linkax.")]
@@ -77,7 +77,7 @@ def sound_numbers(mechanism) -> Bool[Array, ""] | np.bool_:
 
 
 def marked(mechanism, found):
-    """What was found of a mechanism, with NaN for its numbers where `sound_numbers` is false."""
+    """Replace results of a mechanism by NaN where `sound_numbers` is false."""
     sound = sound_numbers(mechanism)
     if concrete(sound):
         return found
@@ -86,12 +86,12 @@ def marked(mechanism, found):
 
 
 def checked_time(entry, name: str):
-    """One time [s]."""
+    """Check one time [s]."""
     return number(entry, (), f"{name} [s]")
 
 
 def checked_state(mechanism, state) -> State:
-    """A state of a mechanism, in floating-point numbers, finite where they are known."""
+    """Check a state of a mechanism: floating-point numbers of the right shapes, finite where they are known."""
     check_mechanism(mechanism)
     topology, made = mechanism.topology, "make the state with linkax.assemble"
     require_type(state, State, "state", made)
@@ -119,7 +119,7 @@ def checked_state(mechanism, state) -> State:
 
 
 def _check_quaternion(coordinates, what):
-    """Coordinates that begin with a quaternion that is a rotation."""
+    """Check that coordinates begin with a quaternion of a rotation."""
 
     def turns(entries):
         size = namespace(entries).linalg.norm(entries[:4])
@@ -132,7 +132,10 @@ def _check_quaternion(coordinates, what):
 
 
 def by_joint(mechanism: Mechanism, given, what: str, count) -> JointValues:
-    """Numbers for joints, checked: {joint or (joint, index): number or array}; `count` tells how many a joint has."""
+    """Check numbers for joints, {joint or (joint, index): number or array}.
+
+    **Arguments:** `count`: joint ↦ how many numbers it has.
+    """
     terms, values = [], []
     given = {} if given is None else given
     require_type(given, Mapping, what, "give {joint: number, ...}")
@@ -155,7 +158,7 @@ def by_joint(mechanism: Mechanism, given, what: str, count) -> JointValues:
 
 
 def coordinates_by_joint(mechanism: Mechanism, given, what: str) -> JointValues:
-    """Coordinates of joints, quaternions whole and not zero."""
+    """Check coordinates of joints: quaternions whole and not zero."""
     found, values = by_joint(mechanism, given, what, lambda joint: joint.num_coordinates), []
     for along, entry in zip(found.terms, found.values, strict=True):
         joint = mechanism.joint(along.joint)
