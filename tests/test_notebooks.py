@@ -9,7 +9,7 @@ import pytest
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
-QUICK = ("crank_slider",)  # the others are minutes of compiling
+QUICK = ("crank_slider", "method")  # the others are minutes of compiling
 mark = lambda path: [] if path.stem in QUICK else [pytest.mark.slow]
 MARKED = [pytest.param(path, marks=mark(path), id=path.stem) for path in NOTEBOOKS]
 
