@@ -57,14 +57,17 @@ class TangentSpace(AbstractFormulation):
     """The paper's formulation: corrections, accelerations and multipliers from one split of the space of speeds.
 
     With A = L⁻¹Jᵀ, W = L Lᵀ the metric, column-pivoted QR gives A P = [Q₁ Q₂] [R₁₁ R₁₂; 0 0]: the columns of L⁻ᵀQ₁
-    span the normal space, those of L⁻ᵀQ₂ the tangent space.
+    span the normal space, those of L⁻ᵀQ₂ the tangent space. In the mass metric each column of A is first
+    scaled to the length of its row of J in radians and lengths of the mechanism, so that τ means the same in each
+    metric; c, b and γ in the formulas below are scaled with it, and so is λ.
 
     **Arguments:**
 
     - `rank_tolerance`: τ; a loop row counts as independent where |R_kk| > τ max(|R₁₁|, 1).
       Default: 1e-6 in double, 1e-5 in single precision.
     - `metric`: W, in which corrections are smallest and normal and tangent space orthogonal:
-      "mass" (default; W = M + JᵀDJ) or "identity" (radians, and lengths of the mechanism).
+      "mass" (default; W = M + JᵀDJ, definite where M is so on the tangent space; the added term, D diagonal,
+      changes neither corrections nor accelerations) or "identity" (radians, and lengths of the mechanism).
     - `corrections`: position corrections in each evaluation and after each step.
 
     **Raises:** `ValueError` for a rank tolerance that is not a positive number of at most 1.
@@ -143,6 +146,7 @@ class TangentSpace(AbstractFormulation):
 
         With B = L⁻ᵀ: v̇ = B Q₁ R₁₁⁻ᵀ (Pᵀγ)ᵣ + B Q₂ ζ, where (B Q₂)ᵀ M (B Q₂) ζ = (B Q₂)ᵀ (f − M B Q₁ R₁₁⁻ᵀ (Pᵀγ)ᵣ);
         the multipliers of the independent rows are λ = P R₁₁⁻¹ (B Q₁)ᵀ (M v̇ − f), those of the others zero.
+        In the mass metric (B Q₂)ᵀ M (B Q₂) = 1, and W in place of M has the multipliers λ + D γ.
         `linkax.linalg.constrained_solve.invert` has the products of the factors.
         """
         inverse = self._with_mass(linear, split)
