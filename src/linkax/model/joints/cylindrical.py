@@ -19,6 +19,8 @@ class Cylindrical(AbstractJoint):
     aligned_axes = (0,)
     locked_translations = (1, 2)
 
+    __init__ = AbstractJoint.__init__
+
     rotation = staticmethod(hinged)
 
     @staticmethod

@@ -55,7 +55,8 @@ class AbstractJoint(eqx.Module):
     A joint type is this class with its static facts filled in. In the spanning tree it turns
     the child by `rotation` and moves it along `linear_subspace`, both in joint axes. Cut, it
     locks `locked_rotations` and `locked_translations` (Table 1 of the paper), and `measure`
-    reads its coordinates.
+    reads its coordinates. A type with no numbers of its own says `__init__ = AbstractJoint.__init__`,
+    without which type checkers expect its fields as arguments.
     """
 
     # Units of the speeds, one for each: "rad" or "m" (per second).

@@ -19,6 +19,8 @@ class Planar(AbstractJoint):
     aligned_axes = (0,)
     locked_translations = (0,)
 
+    __init__ = AbstractJoint.__init__
+
     rotation = staticmethod(hinged)
 
     @staticmethod

@@ -14,6 +14,8 @@ class Prismatic(AbstractJoint):
     aligned_axes = (0, 1, 2)
     locked_translations = (1, 2)
 
+    __init__ = AbstractJoint.__init__
+
     rotation = staticmethod(unturned)
 
     @staticmethod

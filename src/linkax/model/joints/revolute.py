@@ -16,6 +16,8 @@ class Revolute(AbstractJoint):
     aligned_axes = (0,)
     locked_translations = (0, 1, 2)
 
+    __init__ = AbstractJoint.__init__
+
     rotation = staticmethod(hinged)
 
     @staticmethod

@@ -18,6 +18,8 @@ class Universal(AbstractJoint):
     aligned_axes = ()
     locked_translations = (0, 1, 2)
 
+    __init__ = AbstractJoint.__init__
+
     @staticmethod
     def rotation(coordinates):
         c, s = jnp.cos(coordinates[1]), jnp.sin(coordinates[1])
