@@ -1,4 +1,4 @@
-"""Flexible beams: what they are, and the rigid sections, joints and forces that they are made of.
+"""Flexible beams: what they are, and their elastic forces (`linkax.model.discretisation` takes them apart).
 
 Strains of the axis are the coordinates, linear between nodes: the beam is geometrically exact, its
 elastic forces are linear in its coordinates, and a slender one neither shears nor stretches unless it
@@ -7,20 +7,21 @@ constraints to join a tree of relative coordinates, and rigid segments with spri
 second order only, where strains that are linear between nodes converge with the sixth.)
 """
 
-from typing import NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from linkax.model.bodies import AbstractBody, Frame, RigidBody, body_name
-from linkax.model.constraints import AbstractConstraint
+from linkax.model.bodies import AbstractBody, Frame, body_name
+from linkax.model.elements import Configuration, Motion
 from linkax.model.forces import AbstractForce, Load
-from linkax.model.joints.bending import MASS_PLACES, NUM_STRAINS, BeamSegment, OnBeam, SleevePart, Sliding
-from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import (
+    Matrix,
+    Number,
+    Vector,
     number,
     one_of,
     positive,
@@ -34,8 +35,13 @@ from linkax.model.numbers import (
 )
 from linkax.model.sections import Section
 from linkax.model.terms import Term
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
+NUM_STRAINS = 6
+# Where an element has its mass, between its nodes: Gauss's rule with two points. (Its error and that of the strains
+# have opposite signs in frequencies; those of Simpson's rule have equal ones.)
+MASS_PLACES = np.array([0.5 - np.sqrt(1.0 / 12.0), 0.5 + np.sqrt(1.0 / 12.0)])
 # What a section needs against each component of strain.
 STIFFNESSES = ("torsional_stiffness", *2 * ("bending_stiffness",), "axial_stiffness", *2 * ("shear_stiffness",))
 PLACED = 1e-9  # of an element: rounding of places at its ends
@@ -77,14 +83,24 @@ class Beam(AbstractBody):
     """
 
     name: str = eqx.field(static=True)
-    length: Float[Array, ""]
+    length: Scalar
     section: Section
     elements: int = eqx.field(static=True)
     strains: tuple[int, ...] = eqx.field(static=True)
-    damping: Float[Array, ""]
+    damping: Scalar
 
     def __init__(
-        self, name, length, section, *, elements=8, bends="yz", torsion=True, stretch=True, shear=False, damping=0.0
+        self,
+        name: str,
+        length: Number,
+        section: Section,
+        *,
+        elements: int = 8,
+        bends: Literal["yz", "y", "z", ""] = "yz",
+        torsion: bool = True,
+        stretch: bool = True,
+        shear: bool = False,
+        damping: Number = 0.0,
     ):
         self.name = body_name(name)
         what = f"beam {name!r}"
@@ -109,10 +125,10 @@ class Beam(AbstractBody):
         self.damping = zero_or_more(damping, f"{what}: damping [s]")
 
     @property
-    def reference(self):
+    def reference(self) -> Frame:
         return self.at("base")
 
-    def at(self, where, rotation=None, *, element=None) -> Frame:
+    def at(self, where: str | Number | Vector, rotation: Matrix | None = None, *, element: int | None = None) -> Frame:
         """A frame on this beam, with axes `rotation` in those of its section.
 
         `where`: "base", "tip", a distance [m] from the base along the axis, or [x, y, z] off the axis.
@@ -137,7 +153,7 @@ class Beam(AbstractBody):
         element = int(np.clip(np.floor(along), 0, self.elements - 1))
         return Place(self.name, self.within(offset, what), axes, element)
 
-    def within(self, offset, what: str, first: int = 0, last: int | None = None):
+    def within(self, offset: Array, what: str, first: int = 0, last: int | None = None) -> Float[Array, "3"]:
         """A place [x, y, z], checked to be between two nodes, by default the base and the tip."""
         begin, end = (node * self.element_length for node in (first, self.elements if last is None else last))
         slack = PLACED * self.element_length
@@ -145,12 +161,12 @@ class Beam(AbstractBody):
         return require(offset, inside, what, f"its distance from the base must be from {begin} m to {end} m")
 
     @property
-    def element_length(self) -> Float[Array, ""]:
+    def element_length(self) -> Scalar:
         """[m]."""
         return self.length / self.elements
 
     @property
-    def fastest_frequency(self) -> Float[Array, ""]:
+    def fastest_frequency(self) -> Scalar:
         """Of its natural frequencies the highest, about [rad/s]: of waves as short as its elements.
 
         Masses that it carries lower that little. Factors as found for beams of 2 to 8 elements, within a third.
@@ -158,8 +174,8 @@ class Beam(AbstractBody):
         section, order = self.section, 5.5 / self.element_length
         about, turning = section.bending_stiffness, section.rotary_inertia
 
-        def square(strain):
-            stiffness = section.stiffness(strain)
+        def square(strain: int) -> Any:
+            stiffness: Any = section.stiffness(strain)
             if strain == 0:
                 return order**2 * stiffness / jnp.sum(turning)
             if strain in (1, 2):
@@ -174,61 +190,24 @@ class Beam(AbstractBody):
     @property
     def nodes(self) -> tuple[str, ...]:
         """Names of the sections at its nodes, from the base to the tip."""
-        return tuple(self._section(node) for node in range(self.elements + 1))
+        return tuple(self.section_name(node) for node in range(self.elements + 1))
 
     @property
     def sections(self) -> tuple[str, ...]:
         """Names of its sections: nodes, and where it has its mass between them, counted in elements from the base."""
         places = np.add.outer(np.arange(self.elements), [0.0, *MASS_PLACES]).reshape(-1)
-        return tuple(self._section(place) for place in (*places, self.elements))
+        return tuple(self.section_name(place) for place in (*places, self.elements))
 
-    def _section(self, place):
+    def section_name(self, place: float) -> str:
+        """The name of the section at a place, counted in elements from the base."""
         return f"{self.name}[{np.round(place, 2):g}]"
 
-    def strain(self, coordinates) -> Float[Array, "... n 6"]:
+    def strain(self, coordinates: Float[Array, "*batch coordinates"]) -> Float[jax.Array, "*batch nodes 6"]:
         """Strains at the nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
         of_nodes = coordinates.reshape(*coordinates.shape[:-1], self.elements + 1, len(self.strains))
         found = jnp.zeros((*of_nodes.shape[:-1], NUM_STRAINS), coordinates.dtype)
         length = jnp.reshape(jnp.asarray(self.length), (*np.shape(self.length), 1, 1, 1)[-coordinates.ndim - 1 :])
         return found.at[..., np.array(self.strains)].set(of_nodes * self.elements / length)
-
-    def _bodies(self):
-        density, (about_y, about_z) = self.section.linear_density, self.section.rotary_inertia
-        inertia, share = jnp.stack([about_y + about_z, about_y, about_z]), self.element_length / len(MASS_PLACES)
-        empty = {name: RigidBody(name, 0.0) for name in self.nodes}
-        full = lambda name: RigidBody(name, share * density, inertia=share * inertia)
-        return [empty[name] if name in empty else full(name) for name in self.sections]
-
-    def _segment(self, name, child, element, place):
-        return BeamSegment(name, _reference(self.nodes[element]), child, self, element, place)
-
-    def _joints(self):
-        joints = []
-        for element, far in enumerate(self.nodes[1:]):
-            to_node = self._segment(self.name if element == 0 else far, _reference(far), element, 1.0)
-            between = [(self._section(element + place), float(place)) for place in MASS_PLACES]
-            joints += [to_node, *(self._segment(name, _reference(name), element, place) for name, place in between)]
-        return joints
-
-    def _station(self, name, place):
-        """A massless body at a place on the axis, and the joint that holds it there."""
-        within = place.offset[0] / self.element_length - place.element
-        return RigidBody(name, 0.0), self._segment(name, _reference(name), place.element, within)
-
-    def _sleeve(self, sleeve):
-        """The massless bodies between the parts of a sleeve, and these parts."""
-        between = [RigidBody(f"{sleeve.name}[{element + 1}]", 0.0) for element in range(self.elements - 1)]
-        ends = [sleeve.parent, *(body.reference for body in between), sleeve.child]
-        names = [*(body.name for body in between), sleeve.name]
-        parts = [
-            SleevePart(name, ends[element], ends[element + 1], self, element, sleeve.name)
-            for element, name in enumerate(names)
-        ]
-        return between, parts
-
-
-def _reference(body: str) -> Frame:
-    return Frame(body, np.zeros(3), rotation_matrix(None, body))
 
 
 class BeamElasticity(AbstractForce):
@@ -240,7 +219,7 @@ class BeamElasticity(AbstractForce):
     beam: str = eqx.field(static=True)
     elements: int = eqx.field(static=True)
     stiffness: Float[Array, " n"]
-    damping: Float[Array, ""]
+    damping: Scalar
 
     def __init__(self, beam: Beam):
         self.beam, self.elements = beam.name, beam.elements
@@ -249,10 +228,10 @@ class BeamElasticity(AbstractForce):
         self.damping = beam.damping
 
     @property
-    def terms(self):
+    def terms(self) -> tuple[Term, ...]:
         return (Term(self.beam, 0),)
 
-    def _forces(self, coordinates):
+    def _forces(self, coordinates: Float[Array, " n"]) -> Float[jax.Array, " n"]:
         """K q: strains that are linear between nodes, squared and integrated.
 
         Their second differences count a little less, so that waves have the right speed to one order more.
@@ -265,73 +244,20 @@ class BeamElasticity(AbstractForce):
         of_nodes = coordinates.reshape(self.elements + 1, -1)
         return (jnp.asarray(weights, coordinates.dtype) @ of_nodes * self.stiffness).reshape(-1)
 
-    def load(self, t, motion):
+    def load(self, t: Number, motion: Motion) -> Load:
         none, topology = Load.none(motion.system), motion.system.topology
         q, v = motion.configuration.joint_coordinates(self.beam), motion.joint_speeds(self.beam)
         forces = -self._forces(q + self.damping * v)
         return none._replace(joint_force=none.joint_force.at[topology.speeds[self.beam]].set(forces))
 
     @property
-    def matrix(self) -> Float[Array, "n n"]:
+    def matrix(self) -> Float[jax.Array, "n n"]:
         """K, symmetric and positive definite."""
         return jax.vmap(self._forces)(jnp.eye((self.elements + 1) * len(self.stiffness)))
 
-    def energy(self, coordinates):
+    def energy(self, coordinates: Float[Array, " n"]) -> Scalar:
         """Of its coordinates [J]."""
         return coordinates @ self._forces(coordinates) / 2.0
 
-    def potential_energy(self, configuration):
+    def potential_energy(self, configuration: Configuration) -> Scalar:
         return self.energy(configuration.joint_coordinates(self.beam))
-
-
-class Parts(NamedTuple):
-    """What a mechanism is made of, with beams taken apart."""
-
-    bodies: list[RigidBody]
-    joints: list[AbstractJoint]
-    forces: list[AbstractForce]
-    constraints: list[AbstractConstraint]
-
-
-def discretise_beams(bodies, joints, forces, constraints) -> Parts:
-    """Beams as sections, joints and forces, where they are not yet; places on them, and sleeves, as massless bodies."""
-    names = {body.name for body in bodies}
-    beams = {body.name: body for body in bodies if isinstance(body, Beam) and body.nodes[0] not in names}
-    bodies = [body for body in bodies if not isinstance(body, Beam) or body.name in beams]
-    if not beams:
-        return Parts(bodies, joints, forces, constraints)
-    added, segments = [], [segment for beam in beams.values() for segment in beam._joints()]
-
-    def resolved(frame):
-        if not (isinstance(frame, Place) and frame.body in beams):
-            return frame
-        name = f"{frame.body}({sum(body.name.startswith(frame.body + '(') for body in added) + 1})"
-        body, segment = beams[frame.body]._station(name, frame)
-        added.append(body)
-        segments.append(segment)
-        return Frame(name, jnp.asarray(frame.offset) * np.array([0.0, 1.0, 1.0]), frame.rotation)
-
-    def parts(joint):
-        if not (isinstance(joint, Sliding) and joint.beam in beams):
-            return [joint]
-        between, of_sleeve = beams[joint.beam]._sleeve(joint)
-        added.extend(between)
-        return of_sleeve
-
-    with_frames = lambda elements: [
-        jax.tree.map(resolved, element, is_leaf=lambda part: isinstance(part, Frame)) for element in elements
-    ]
-    joints, forces, constraints = map(with_frames, (joints, forces, constraints))
-    joints = [part for joint in joints for part in parts(joint)]
-    return Parts(
-        [part for body in bodies for part in (body._bodies() if isinstance(body, Beam) else [body])] + added,
-        [*segments, *joints],
-        [*forces, *map(BeamElasticity, beams.values())],
-        constraints,
-    )
-
-
-def held_first(joints) -> list[set[str]]:
-    """Names of joints that must be in the tree, those of beams themselves before those that slide on them."""
-    of_beams = {joint.name for joint in joints if isinstance(joint, BeamSegment)}
-    return [of_beams, {joint.name for joint in joints if isinstance(joint, OnBeam)}]

@@ -2,23 +2,27 @@
 
 import abc
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.model.numbers import (
     Constant,
+    Matrix,
+    Number,
+    Vector,
     namespace,
     number,
     positive,
     require,
     require_type,
     rotation_matrix,
-    value,
     zero_or_more,
 )
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
 GROUND_NAME = "ground"
@@ -54,10 +58,10 @@ class Ground(AbstractBody):
         return GROUND_NAME
 
     @property
-    def reference(self):
+    def reference(self) -> Frame:
         return self.at([0.0, 0.0, 0.0])
 
-    def at(self, offset, rotation=None) -> Frame:
+    def at(self, offset: Vector, rotation: Matrix | None = None) -> Frame:
         """A frame fixed to the ground: origin `offset` [m] and axes `rotation` in world axes."""
         return Frame(
             GROUND_NAME,
@@ -67,6 +71,8 @@ class Ground(AbstractBody):
 
 
 GROUND = Ground()
+
+BodyOrFrame = AbstractBody | Frame  # what a user may attach to: a body stands for its reference frame
 
 
 class RigidBody(AbstractBody):
@@ -86,12 +92,19 @@ class RigidBody(AbstractBody):
     """
 
     name: str = eqx.field(static=True)
-    mass: Float[Array, ""]
+    mass: Scalar
     center_of_mass: Float[Array, "3"]
     inertia: Float[Array, "3 3"]
     frames: dict[str, Float[Array, "3"]]
 
-    def __init__(self, name, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(0.0, 0.0, 0.0), frames=None):
+    def __init__(
+        self,
+        name: str,
+        mass: Number,
+        center_of_mass: Vector = (0.0, 0.0, 0.0),
+        inertia: Matrix = (0.0, 0.0, 0.0),
+        frames: Mapping[str, Vector] | None = None,
+    ):
         self.name = body_name(name)
         self.mass = zero_or_more(mass, f"body {name!r}: mass [kg]")
         self.center_of_mass = number(center_of_mass, (3,), f"body {name!r}: center_of_mass [m]")
@@ -103,16 +116,16 @@ class RigidBody(AbstractBody):
             for label, offset in frames.items()
         }
 
-    def _label(self, label):
+    def _label(self, label: Any) -> str:
         if not isinstance(label, str) or not label:
             raise ValueError(f"body {self.name!r}: name of a frame is {label!r}; give a non-empty string")
         return label
 
     @property
-    def reference(self):
+    def reference(self) -> Frame:
         return self.at([0.0, 0.0, 0.0])
 
-    def at(self, where, rotation=None) -> Frame:
+    def at(self, where: str | Vector, rotation: Matrix | None = None) -> Frame:
         """A frame on this body: at a named frame or at an offset [m], with axes `rotation`.
 
         **Arguments:**
@@ -132,7 +145,7 @@ class RigidBody(AbstractBody):
         return Frame(self.name, offset, rotation_matrix(rotation, f"rotation of a frame on body {self.name!r}"))
 
 
-def body_name(name) -> str:
+def body_name(name: Any) -> str:
     """The name of a body, checked."""
     if not isinstance(name, str) or not name:
         raise ValueError(f"body name is {name!r}; give a non-empty string")
@@ -141,7 +154,7 @@ def body_name(name) -> str:
     return name
 
 
-def frame_of(place, what) -> Frame:
+def frame_of(place: BodyOrFrame, what: str) -> Frame:
     """The frame that a user means by a body, `body.at(...)`, or the ground; `what` names it in errors."""
     if isinstance(place, AbstractBody):
         return place.reference
@@ -150,16 +163,16 @@ def frame_of(place, what) -> Frame:
     raise ValueError(f"{what} is {place!r}; give a body, body.at(...), or lx.GROUND")
 
 
-def _depth(entry) -> int:
+def _depth(entry: Any) -> int:
     """Number of dimensions of an array, or of lists of numbers that may be traced."""
     if isinstance(entry, list | tuple):
         return 1 + (_depth(entry[0]) if entry else 0)
     return np.ndim(entry)
 
 
-def inertia_tensor(inertia, what):
+def inertia_tensor(inertia: Matrix, what: str) -> Float[Array, "3 3"]:
     """A tensor that a body can have, (3, 3), of itself or of its diagonal; `what` names it in errors."""
-    diagonal = _depth(value(inertia)) == 1
+    diagonal = _depth(inertia) == 1
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)
     if diagonal:
         tensor = tensor * np.eye(3)
@@ -174,18 +187,18 @@ def inertia_tensor(inertia, what):
     return require(tensor, lambda _: moments[2] <= largest, what, remedy)
 
 
-def _is_symmetric(tensor):
+def _is_symmetric(tensor: Array) -> Any:
     return abs(tensor - tensor.T).max() <= 1e-12 * abs(tensor).max()
 
 
-def _principal_moments(tensor, diagonal):
+def _principal_moments(tensor: Array, diagonal: bool) -> Float[Array, "3"]:
     """In rising order; without derivative."""
     xp = namespace(tensor)
     tensor = tensor if xp is np else lax.stop_gradient(tensor)
     return xp.sort(xp.diagonal(tensor)) if diagonal else xp.linalg.eigvalsh(tensor / 2.0 + tensor.T / 2.0)
 
 
-def rod(name: str, length, mass) -> RigidBody:
+def rod(name: str, length: Number, mass: Number) -> RigidBody:
     """A uniform slender rod along its x axis, from frame "base" (its reference) to "tip".
 
     `length` [m], `mass` [kg]; mass × length² / 12 about the transverse axes, none about its own.
@@ -202,12 +215,12 @@ def rod(name: str, length, mass) -> RigidBody:
     )
 
 
-def point_mass(name: str, mass) -> RigidBody:
+def point_mass(name: str, mass: Number) -> RigidBody:
     """A mass [kg] at the origin of its frame, without rotational inertia."""
     return RigidBody(name, mass)
 
 
-def box(name: str, size, mass) -> RigidBody:
+def box(name: str, size: Vector, mass: Number) -> RigidBody:
     """A uniform box with its centre as reference; `size` is its extent along x, y, z [m]."""
     what = f"box {name!r}: size [m]"
     size = require(number(size, (3,), what), lambda metres: (metres > 0.0).all(), what, "all must be positive")

@@ -15,22 +15,30 @@ import sysconfig
 import types
 import typing
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dis import get_instructions
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+
+Maker = Callable[[Iterator[Any]], Any]  # makes a value again, of the numbers in it
 
 
 class Code:
     """A function without its numbers; equal to that of another function that computes the same of the same numbers."""
 
+    function: Callable[..., Any]
+    _key: Any
+    _hash: int
+    _made: Maker
+    _arrays: list[weakref.ref | None]
+
     @staticmethod
-    def of(function: Callable) -> "tuple[Code, tuple[Array, ...]]":
+    def of(function: Callable[..., Any]) -> "tuple[Code, tuple[jax.Array, ...]]":
         """The code of a function, and its numbers.
 
         Numbers are JAX arrays, and in pytrees such as `jax.tree_util.Partial` and `equinox.Module` also
@@ -45,22 +53,22 @@ class Code:
                 if walk.names == names:
                     break
         except (_Undecided, RecursionError):
-            walk, key, code._made = _Walk(()), _Same(function), None
+            walk, key, code._made = _Walk(()), _Same(function), lambda _: function
         code.function, code._key, code._hash = function, key, hash(key)
         code._arrays = [weakref.ref(array) if isinstance(array, jax.Array) else None for array in walk.numbers]
         # Of NumPy's arrays copies, as the caller's may change.
         return code, tuple(array if isinstance(array, jax.Array) else jnp.array(array) for array in walk.numbers)
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, Code) and self._hash == other._hash and self._key == other._key)
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return self._hash
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple:
         return _code_of, (self.function,)
 
-    def with_numbers(self, numbers) -> Callable:
+    def with_numbers(self, numbers: Sequence[Any]) -> Callable[..., Any]:
         """The function, with these numbers in place of its own."""
         return self._made(iter(numbers)) if self._arrays else self.function
 
@@ -79,7 +87,7 @@ class Code:
         return now != self or any(ref is not None and ref() is not number for ref, number in held)
 
 
-def _code_of(function):
+def _code_of(function: Callable[..., Any]) -> Code:
     return Code.of(function)[0]
 
 
@@ -90,13 +98,13 @@ class _Undecided(Exception):
 class _Same:
     """A value that equals itself alone."""
 
-    def __init__(self, value):
+    def __init__(self, value: Any):
         self.value = value
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, _Same) and self.value is other.value
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return id(self.value)
 
 
@@ -117,7 +125,7 @@ _LIBRARIES = tuple(
 )
 
 
-def _is_library(value) -> bool:
+def _is_library(value: Any) -> bool:
     """Whether a module, class or function is one that no user changes: of Python, an installed package, or linkax."""
     if isinstance(value, types.FunctionType):
         path = value.__code__.co_filename
@@ -129,11 +137,11 @@ def _is_library(value) -> bool:
     return path.startswith((*_LIBRARIES, "<frozen"))
 
 
-def _is_pytree(value) -> bool:
+def _is_pytree(value: Any) -> bool:
     return not jax.tree_util.all_leaves([value])
 
 
-def _all_code(code):
+def _all_code(code: types.CodeType) -> Iterator[types.CodeType]:
     """Code, and that of functions in it."""
     yield code
     for constant in code.co_consts:
@@ -142,7 +150,7 @@ def _all_code(code):
 
 
 @functools.lru_cache(maxsize=1024)
-def _names(code) -> tuple[set[str], set[str]]:
+def _names(code: types.CodeType) -> tuple[set[str], set[str]]:
     """Names of globals and attributes in code, and of modules that it imports when it runs."""
     names, imported = set(), set()
     for part in _all_code(code):
@@ -166,11 +174,11 @@ class _Walk:
     - `names`: those in all code met so far. `numbers`: those met so far.
     """
 
-    def __init__(self, names):
+    def __init__(self, names: Iterable[str]):
         self.names, self.numbers = set(names), []
         self._attributes, self._around, self._count, self._is_traced = frozenset(names), [], 0, True
 
-    def part(self, value, is_explicit=False):
+    def part(self, value: Any, is_explicit: bool = False) -> tuple[Any, Maker]:
         """Key and maker of a value.
 
         Where `is_explicit`, its floats and NumPy's arrays are numbers too, and what cannot be decided in it is
@@ -203,14 +211,14 @@ class _Walk:
         finally:
             self._around.pop()
 
-    def key(self, value):
+    def key(self, value: Any) -> Any:
         """Key of what is read, and not made again: its arrays are no numbers."""
         traced, self._is_traced = self._is_traced, False
         key, _ = self.part(value)
         self._is_traced = traced
         return key
 
-    def _atom(self, value):
+    def _atom(self, value: Any) -> Any:
         if type(value) in _ATOMS or isinstance(value, np.dtype):
             return type(value), repr(value)  # tells 0.0 from -0.0, and 1 from 1.0
         if isinstance(value, np.generic) or type(value) is np.ndarray:
@@ -224,7 +232,7 @@ class _Walk:
             return _Same(value)
         return None
 
-    def _compound(self, value, is_explicit):
+    def _compound(self, value: Any, is_explicit: bool) -> tuple[Any, Maker]:
         kind = type(value)
         if kind is types.FunctionType:
             return self._function(value)
@@ -253,12 +261,14 @@ class _Walk:
             return (_Same(value), self._read(value)), lambda _: value
         return self._instance(value)
 
-    def _parts(self, kind, values, made, explicit):
+    def _parts(
+        self, kind: Any, values: Iterable[Any], made: Callable[[list[Any]], Any], explicit: Sequence[bool]
+    ) -> tuple[Any, Maker]:
         found = [self.part(value, is_explicit) for value, is_explicit in zip(values, explicit, strict=True)]
         makers = [maker for _, maker in found]
         return (kind, *(key for key, _ in found)), lambda numbers: made([maker(numbers) for maker in makers])
 
-    def _pytree(self, value, is_explicit):
+    def _pytree(self, value: Any, is_explicit: bool) -> tuple[Any, Maker]:
         leaves, structure = jax.tree.flatten(value, is_leaf=lambda node: node is not value)
         try:
             hash(structure)
@@ -266,7 +276,7 @@ class _Walk:
             raise _Undecided from error
         return self._parts(structure, leaves, structure.unflatten, [is_explicit] * len(leaves))
 
-    def _function(self, function):
+    def _function(self, function: types.FunctionType) -> tuple[Any, Maker]:
         code = function.__code__
         names, imported = _names(code)
         if not sys.modules.keys() >= imported:
@@ -281,7 +291,7 @@ class _Walk:
         spaces = (vars(builtins), function.__globals__, {name: sys.modules[name] for name in imported})
         read = self.key([[(name, space[name]) for name in sorted(names) if name in space] for space in spaces])
 
-        def made(numbers):
+        def made(numbers: Iterator[Any]) -> types.FunctionType:
             closed_over, defaults, keywords = maker(numbers)
             cells = tuple(map(types.CellType, closed_over))
             again = types.FunctionType(code, function.__globals__, function.__name__, defaults, cells)
@@ -291,14 +301,14 @@ class _Walk:
 
         return (code, _Same(function.__globals__), key, read, self.key(vars(function))), made
 
-    def _instance(self, value):
+    def _instance(self, value: Any) -> tuple[Any, Maker]:
         kind = type(value)
         of_user = [base for base in kind.__mro__ if base not in _BASES]
         if not hasattr(value, "__dict__") or any(map(_is_library, of_user)):
             raise _Undecided
         return (_Same(kind), self._read(kind), self._read(value)), lambda _: value
 
-    def _read(self, space):
+    def _read(self, space: Any) -> Any:
         """Key of the attributes of a module, class or instance that code names, or calls without a name."""
         spaces = [base for base in space.__mro__ if not _is_library(base)] if isinstance(space, type) else [space]
         found = {}

@@ -1,17 +1,20 @@
 """Constraints besides those of cut joints: gears, ropes over sheaves, drives."""
 
 import abc
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.model.elements import AbstractElement
 from linkax.model.functions import Law, held_unless
-from linkax.model.numbers import number, require
-from linkax.model.terms import Term, term
+from linkax.model.numbers import Number, number, require
+from linkax.model.terms import Term, TermLike, term
+from linkax.xla.arrays import Array, Scalar
 
 
 class AbstractConstraint(AbstractElement):
@@ -20,7 +23,7 @@ class AbstractConstraint(AbstractElement):
     name: str = eqx.field(static=True)
 
     @property
-    def display_name(self):
+    def display_name(self) -> str:
         return f"{type(self).__name__.lower()} {self.name!r}"
 
     @property
@@ -29,10 +32,10 @@ class AbstractConstraint(AbstractElement):
         return False
 
     @abc.abstractmethod
-    def right_side(self, t) -> Float[Array, ""]:
+    def right_side(self, t: Number) -> Scalar:
         """At time t [s]."""
 
-    def held(self, t, unless=False) -> "AbstractConstraint":
+    def held(self, t: Number, unless: Any = False) -> "AbstractConstraint":
         """The same with the right side of time t for ever, where it is not to go on; that may be traced."""
         return self
 
@@ -47,7 +50,7 @@ class LinearConstraint(AbstractConstraint):
     coefficients: Float[Array, " n"]
 
     @property
-    def terms(self):
+    def terms(self) -> tuple[Term, ...]:
         return self.related
 
 
@@ -68,11 +71,16 @@ class Coupling(LinearConstraint):
     **Raises:** `ValueError` for no coefficient, or for all of them zero.
     """
 
-    offset: Float[Array, ""]
+    offset: Scalar
 
-    def __init__(self, name: str, coefficients, offset=0.0):
+    def __init__(
+        self,
+        name: str,
+        coefficients: Mapping[str, Number] | Mapping[TermLike, Number],
+        offset: Number = 0.0,
+    ):
         self.name = checked_name(name, "coupling")
-        if not isinstance(coefficients, dict) or not coefficients:
+        if not isinstance(coefficients, Mapping) or not coefficients:
             raise ValueError(f"coupling {name!r}: coefficients are {coefficients!r}; give {{joint: factor, ...}}")
         self.related = tuple(term(key, f"coupling {name!r}") for key in coefficients)
         what = f"coupling {name!r}: coefficients"
@@ -81,7 +89,7 @@ class Coupling(LinearConstraint):
         self.coefficients = require(factors, lambda x: (x != 0.0).any(), what, remedy)
         self.offset = number(offset, (), f"coupling {name!r}: offset")
 
-    def right_side(self, t):
+    def right_side(self, t: Number) -> Scalar:
         return self.offset
 
 
@@ -103,7 +111,7 @@ class Drive(LinearConstraint):
 
     motion: Law
 
-    def __init__(self, name: str, joint, motion):
+    def __init__(self, name: str, joint: TermLike, motion: Callable[[Any], Number]):
         self.name = checked_name(name, "drive")
         self.related = (term(joint, f"drive {name!r}"),)
         self.coefficients = np.ones(1)
@@ -113,19 +121,19 @@ class Drive(LinearConstraint):
         jax.eval_shape(self.motion, jnp.zeros(()))
 
     @property
-    def is_driven(self):
+    def is_driven(self) -> bool:
         return True
 
-    def right_side(self, t):
+    def right_side(self, t: Number) -> Scalar:
         return self.motion(t)
 
-    def held(self, t, unless=False):
+    def held(self, t: Number, unless: Any = False) -> "Drive | Coupling":
         if unless is not False:
             return Drive(self.name, self.terms[0], held_unless(self.motion, t, unless))
-        return Coupling(self.name, dict(zip(self.terms, np.ones(1), strict=True)), self.right_side(t))
+        return Coupling(self.name, {self.terms[0]: 1.0}, self.right_side(t))
 
 
-def checked_name(name, what) -> str:
+def checked_name(name: Any, what: str) -> str:
     """The name of a constraint, checked."""
     if not isinstance(name, str) or not name:
         raise ValueError(f"{what} name is {name!r}; give a non-empty string")

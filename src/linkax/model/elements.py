@@ -1,11 +1,17 @@
 """What forces and constraints have in common: joints that they act along, frames that they attach to."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 
 from linkax.model.bodies import Frame
 from linkax.model.terms import Term
+
+# Of higher layers, which import this one: linkax.Motion, its `configuration`, and its `system`.
+Motion = Any
+Configuration = Any
+System = Any
 
 
 class AbstractElement(eqx.Module):

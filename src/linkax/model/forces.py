@@ -1,19 +1,23 @@
 """Force elements: what acts on a mechanism besides its joints."""
 
 import abc
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from linkax.model.bodies import GROUND_NAME, Frame, frame_of
-from linkax.model.elements import AbstractElement
+from linkax.model.bodies import GROUND_NAME, BodyOrFrame, Frame, frame_of
+from linkax.model.elements import AbstractElement, Configuration, Motion, System
 from linkax.model.functions import Law, evaluated, number_or_law, raised
-from linkax.model.numbers import number, one_of, positive, zero_or_more
-from linkax.model.terms import Term, term
+from linkax.model.numbers import Number, Vector, number, one_of, positive, zero_or_more
+from linkax.model.terms import Term, TermLike, term
 from linkax.spatial.vectors import dot
+from linkax.xla.arrays import Array, Scalar
+
+Axes = Literal["ground", "frame"]
 
 
 class Load(NamedTuple):
@@ -24,12 +28,12 @@ class Load(NamedTuple):
     - `joint_force`: along each speed of the tree [N m or N], shape (n_v,).
     """
 
-    force: Float[Array, "n_b 3"]
-    moment: Float[Array, "n_b 3"]
-    joint_force: Float[Array, " n_v"]
+    force: Float[jax.Array, "bodies 3"]
+    moment: Float[jax.Array, "bodies 3"]
+    joint_force: Float[jax.Array, " speeds"]
 
     @staticmethod
-    def none(system) -> "Load":
+    def none(system: System) -> "Load":
         vectors = jnp.zeros((system.topology.num_bodies, 3), system.dtype)
         return Load(vectors, vectors, jnp.zeros(system.topology.num_speeds, system.dtype))
 
@@ -58,25 +62,25 @@ class AbstractForce(AbstractElement):
         return False
 
     @property
-    def display_name(self):
+    def display_name(self) -> str:
         return _described(type(self).__name__, [repr(name) for name in self.joints] or _named(self.frames))
 
     @abc.abstractmethod
-    def load(self, t, motion) -> Load:
+    def load(self, t: Number, motion: Motion) -> Load:
         """What the element applies at time t [s].
 
         Where it has a `switch`, a third argument `on` says whether that is positive. A step that adapts keeps it as it
         is where the step begins, so that the load goes on smoothly a little past zero.
         """
 
-    def switch(self, t, motion) -> Float[Array, ""]:
+    def switch(self, t: Number, motion: Motion) -> Scalar | None:
         """A number whose sign changes where the load has a kink or jumps; of magnitude one, like a strain.
 
         The motion must go through zero there, and not be pushed back from both sides. None where there is none.
         """
         return None
 
-    def switched(self, t, motion) -> Float[Array, ""]:
+    def switched(self, t: Number, motion: Motion) -> Float[jax.Array, ""]:
         """The switch, checked for what a user's own class may do wrong."""
         try:
             found = self.switch(t, motion)
@@ -88,7 +92,7 @@ class AbstractForce(AbstractElement):
             )
         return found
 
-    def applied(self, t, motion, on=None) -> Load:
+    def applied(self, t: Number, motion: Motion, on: Any = None) -> Load:
         """The load, checked for what a user's own class may do wrong; `on`: see `load`, by default as it is."""
         side = ()
         if has_switch(self):
@@ -109,7 +113,7 @@ class AbstractForce(AbstractElement):
                 )
         return found
 
-    def potential_energy(self, configuration):
+    def potential_energy(self, configuration: Configuration) -> Scalar:
         """Potential energy [J]; zero for an element that has none."""
         return jnp.zeros((), configuration.system.dtype)
 
@@ -119,11 +123,11 @@ def has_switch(force: AbstractForce) -> bool:
     return type(force).switch is not AbstractForce.switch
 
 
-def _described(kind, of):
+def _described(kind: str, of: list[str]) -> str:
     return f"{kind} on {' and '.join(of)}" if of else kind
 
 
-def _named(frames):
+def _named(frames: Iterable[Frame]) -> list[str]:
     return [f"body {frame.body!r}" for frame in frames]
 
 
@@ -132,14 +136,14 @@ class Gravity(AbstractForce):
 
     acceleration: Float[Array, "3"]
 
-    def __init__(self, acceleration):
+    def __init__(self, acceleration: Vector):
         self.acceleration = number(acceleration, (3,), "Gravity: acceleration [m/s²]")
 
-    def load(self, t, motion):
+    def load(self, t: Number, motion: Motion) -> Load:
         none = Load.none(motion.system)
         return none._replace(force=motion.system.mass[:, None] * self.acceleration)
 
-    def potential_energy(self, configuration):
+    def potential_energy(self, configuration: Configuration) -> Scalar:
         weights = configuration.system.mass[:, None] * self.acceleration
         return -jnp.sum(weights * configuration.world_center_of_mass())
 
@@ -150,14 +154,14 @@ class _AlongJoint(AbstractForce):
     joint: Term = eqx.field(static=True)
 
     @property
-    def terms(self):
+    def terms(self) -> tuple[Term, ...]:
         return (self.joint,)
 
     @abc.abstractmethod
-    def torque_at(self, t, motion) -> Float[Array, ""]:
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
         """Along the joint, on the child [N m or N]."""
 
-    def load(self, t, motion):
+    def load(self, t: Number, motion: Motion) -> Load:
         return motion.joint_load(self.joint, self.torque_at(t, motion))
 
 
@@ -171,13 +175,13 @@ class JointTorque(_AlongJoint):
       `linkax.Motion`. What the function reads is as for `linkax.Drive`.
     """
 
-    torque: Float[Array, ""] | Law
+    torque: Scalar | Law
 
-    def __init__(self, joint, torque):
+    def __init__(self, joint: TermLike, torque: Number | Callable[[Any, Any], Number]):
         self.joint = term(joint, "JointTorque")
         self.torque = number_or_law(torque, (), f"JointTorque on {self.joint.joint!r}: torque [N m or N]")
 
-    def torque_at(self, t, motion):
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
         return evaluated(self.torque, t, motion)
 
 
@@ -191,36 +195,36 @@ class JointSpring(_AlongJoint):
     coordinate at which it is unstrained [rad or m].
     """
 
-    stiffness: Float[Array, ""]
-    free: Float[Array, ""]
+    stiffness: Scalar
+    free: Scalar
 
-    def __init__(self, joint, stiffness, free=0.0):
+    def __init__(self, joint: TermLike, stiffness: Number, free: Number = 0.0):
         self.joint = term(joint, "JointSpring")
         what = f"JointSpring on {self.joint.joint!r}"
         self.stiffness = number(stiffness, (), f"{what}: stiffness [N m/rad or N/m]")
         self.free = number(free, (), f"{what}: free [rad or m]")
 
     @property
-    def needs_coordinate(self):
+    def needs_coordinate(self) -> bool:
         return True
 
-    def torque_at(self, t, motion):
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
         return -self.stiffness * motion.configuration.joint_displacement(self.joint, self.free)
 
-    def potential_energy(self, configuration):
+    def potential_energy(self, configuration: Configuration) -> Scalar:
         return self.stiffness * configuration.joint_displacement(self.joint, self.free) ** 2 / 2.0
 
 
 class JointDamper(_AlongJoint):
     """Viscous damping along a joint: −damping × speed, `damping` in N m s/rad or N s/m."""
 
-    damping: Float[Array, ""]
+    damping: Scalar
 
-    def __init__(self, joint, damping):
+    def __init__(self, joint: TermLike, damping: Number):
         self.joint = term(joint, "JointDamper")
         self.damping = number(damping, (), f"JointDamper on {self.joint.joint!r}: damping [N m s/rad or N s/m]")
 
-    def torque_at(self, t, motion):
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
         return -self.damping * motion.joint_rate(self.joint)
 
 
@@ -233,16 +237,16 @@ class JointFriction(_AlongJoint):
     **Raises:** `ValueError` for a negative torque, or a scale that is not positive.
     """
 
-    torque: Float[Array, ""]
-    scale: Float[Array, ""]
+    torque: Scalar
+    scale: Scalar
 
-    def __init__(self, joint, torque, scale):
+    def __init__(self, joint: TermLike, torque: Number, scale: Number):
         self.joint = term(joint, "JointFriction")
         what = f"JointFriction on {self.joint.joint!r}"
         self.torque = zero_or_more(torque, f"{what}: torque [N m or N]")
         self.scale = positive(scale, f"{what}: scale [rad/s or m/s]")
 
-    def torque_at(self, t, motion):
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
         return -self.torque * jnp.tanh(motion.joint_rate(self.joint) / self.scale)
 
 
@@ -253,19 +257,19 @@ class _BetweenPoints(AbstractForce):
     second: Frame
 
     @property
-    def frames(self):
+    def frames(self) -> tuple[Frame, ...]:
         return (self.first, self.second)
 
     @abc.abstractmethod
-    def pull(self, motion) -> Float[Array, "3"]:
+    def pull(self, motion: Motion) -> Float[Array, "3"]:
         """The force on the first point; its opposite acts on the second [N]."""
 
-    def load(self, t, motion):
+    def load(self, t: Number, motion: Motion) -> Load:
         force = self.pull(motion)
         return motion.point_load(self.first, force).plus(motion.point_load(self.second, -force))
 
 
-def _unit(vector):
+def _unit(vector: Float[Array, "3"]) -> Float[jax.Array, "3"]:
     """The direction of a vector; zero for none."""
     square = dot(vector, vector)
     return jnp.where(square > 0.0, vector / jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
@@ -280,19 +284,19 @@ class Spring(_BetweenPoints):
     `stiffness` [N/m]; `free_length` [m], zero or more.
     """
 
-    stiffness: Float[Array, ""]
-    free_length: Float[Array, ""]
+    stiffness: Scalar
+    free_length: Scalar
 
-    def __init__(self, first, second, stiffness, free_length=0.0):
+    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, stiffness: Number, free_length: Number = 0.0):
         self.first, self.second = _frames("Spring", first, second)
         self.stiffness = number(stiffness, (), f"{self.display_name}: stiffness [N/m]")
         self.free_length = zero_or_more(free_length, f"{self.display_name}: free_length [m]")
 
-    def pull(self, motion):
+    def pull(self, motion: Motion) -> Float[Array, "3"]:
         along = motion.configuration.between(self.first, self.second)
         return self.stiffness * (along - self.free_length * _unit(along))
 
-    def potential_energy(self, configuration):
+    def potential_energy(self, configuration: Configuration) -> Scalar:
         along = configuration.between(self.first, self.second)
         stretch = dot(along, _unit(along)) - self.free_length
         return self.stiffness * stretch**2 / 2.0
@@ -304,13 +308,13 @@ class Damper(_BetweenPoints):
     `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
     """
 
-    damping: Float[Array, ""]
+    damping: Scalar
 
-    def __init__(self, first, second, damping):
+    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, damping: Number):
         self.first, self.second = _frames("Damper", first, second)
         self.damping = number(damping, (), f"{self.display_name}: damping [N s/m]")
 
-    def pull(self, motion):
+    def pull(self, motion: Motion) -> Float[Array, "3"]:
         direction = _unit(motion.configuration.between(self.first, self.second))
         rate = dot(motion.point_velocity(self.second) - motion.point_velocity(self.first), direction)
         return self.damping * rate * direction
@@ -320,9 +324,9 @@ class _OnPoint(AbstractForce):
     """A vector on a point of a body, in ground axes or in those of the frame there."""
 
     point: Frame
-    axes: Literal["ground", "frame"] = eqx.field(static=True)
+    axes: Axes = eqx.field(static=True)
 
-    def __init__(self, point, axes):
+    def __init__(self, point: BodyOrFrame, axes: Axes):
         self.point = frame_of(point, f"{type(self).__name__}: point")
         if self.point.body == GROUND_NAME:
             raise ValueError(
@@ -331,10 +335,10 @@ class _OnPoint(AbstractForce):
         self.axes = one_of(axes, ("ground", "frame"), f"{self.display_name}: axes")
 
     @property
-    def frames(self):
+    def frames(self) -> tuple[Frame, ...]:
         return (self.point,)
 
-    def _in_ground_axes(self, entry, t, motion):
+    def _in_ground_axes(self, entry: Array | Law, t: Number, motion: Motion) -> Float[Array, "3"]:
         vector = evaluated(entry, t, motion)
         return motion.configuration.axes(self.point) @ vector if self.axes == "frame" else vector
 
@@ -351,11 +355,11 @@ class PointForce(_OnPoint):
 
     force: Float[Array, "3"] | Law
 
-    def __init__(self, point, force, axes="ground"):
+    def __init__(self, point: BodyOrFrame, force: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground"):
         super().__init__(point, axes)
         self.force = number_or_law(force, (3,), f"{self.display_name}: force [N]")
 
-    def load(self, t, motion):
+    def load(self, t: Number, motion: Motion) -> Load:
         return motion.point_load(self.point, self._in_ground_axes(self.force, t, motion))
 
 
@@ -367,17 +371,17 @@ class PointMoment(_OnPoint):
 
     moment: Float[Array, "3"] | Law
 
-    def __init__(self, point, moment, axes="ground"):
+    def __init__(self, point: BodyOrFrame, moment: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground"):
         super().__init__(point, axes)
         self.moment = number_or_law(moment, (3,), f"{self.display_name}: moment [N m]")
 
-    def load(self, t, motion):
+    def load(self, t: Number, motion: Motion) -> Load:
         nothing = jnp.zeros(3, motion.system.dtype)
         return motion.point_load(self.point, nothing, self._in_ground_axes(self.moment, t, motion))
 
 
-def _frames(kind, first, second):
-    first, second = frame_of(first, f"{kind}: first point"), frame_of(second, f"{kind}: second point")
-    if first.body == second.body:
-        raise ValueError(f"{_described(kind, _named([first]))}: both points are on it; give points on two bodies")
-    return first, second
+def _frames(kind: str, first: BodyOrFrame, second: BodyOrFrame) -> tuple[Frame, Frame]:
+    ends = frame_of(first, f"{kind}: first point"), frame_of(second, f"{kind}: second point")
+    if ends[0].body == ends[1].body:
+        raise ValueError(f"{_described(kind, _named(ends[:1]))}: both points are on it; give points on two bodies")
+    return ends

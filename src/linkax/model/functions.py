@@ -1,14 +1,19 @@
 """Functions that users hand to a mechanism: laws of drives and forces."""
 
 from collections.abc import Callable
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Float
 
 from linkax.model.code import Code
-from linkax.model.numbers import converted, number
+from linkax.model.numbers import Number, converted, number
+from linkax.xla.arrays import Array
+
+Numbers = TypeVar("Numbers", bound=Array | np.floating)
 
 
 class Function(eqx.Module):
@@ -17,13 +22,13 @@ class Function(eqx.Module):
     Both are those of the moment when this is made.
     """
 
-    numbers: tuple[Array, ...]
+    numbers: tuple[jax.Array, ...]
     code: Code = eqx.field(static=True)
 
-    def __init__(self, function: Callable):
+    def __init__(self, function: Callable[..., Any]):
         self.code, self.numbers = Code.of(function)
 
-    def __call__(self, *arguments):
+    def __call__(self, *arguments: Any) -> Any:
         return self.code.with_numbers(self.numbers)(*arguments)
 
 
@@ -34,10 +39,10 @@ class Law(eqx.Module):
     shape: tuple[int, ...] = eqx.field(static=True)
     what: str = eqx.field(static=True)
 
-    def __init__(self, function: Callable, shape, what: str):
+    def __init__(self, function: Callable[..., Any], shape: tuple[int, ...], what: str):
         self.function, self.shape, self.what = Function(function), shape, what
 
-    def check(self):
+    def check(self) -> None:
         """Whether what the function reads is what it was when the mechanism was built."""
         if self.function.code.has_changed():
             variables = ", ".join(self.function.code.variables)
@@ -46,7 +51,7 @@ class Law(eqx.Module):
                 "build the mechanism anew"
             )
 
-    def __call__(self, *arguments):
+    def __call__(self, *arguments: Any) -> Float[jax.Array, "..."]:
         self.check()
         try:
             found = self.function(*arguments)
@@ -59,24 +64,24 @@ class Law(eqx.Module):
         return found if jnp.issubdtype(found.dtype, jnp.floating) else 1.0 * found
 
 
-def raised(error) -> str:
+def raised(error: Exception) -> str:
     """What a user's function raised, and what it is often due to."""
     first, *_ = str(error).split("\n")
     remedy = "make it of operations of jax.numpy, with jnp.where in place of if"
     return f"{type(error).__name__}: {first}; JAX traces it, so {remedy}"
 
 
-def number_or_law(entry, shape: tuple[int, ...], what: str):
+def number_or_law(entry: Any, shape: tuple[int, ...], what: str) -> Array | Law:
     """A traced number of the given shape, or a function that returns one."""
     return Law(entry, shape, what) if callable(entry) else number(entry, shape, what)
 
 
-def evaluated(entry, *arguments):
+def evaluated(entry: Numbers | Law, *arguments: Any) -> Numbers | jax.Array:
     """A number, or what a `Law` says."""
     return entry(*arguments) if isinstance(entry, Law) else entry
 
 
-def held_unless(law: Law, t, moves):
+def held_unless(law: Law, t: Number, moves: Any) -> Callable[..., Any]:
     """A function of time as it is where `moves`; elsewhere as it is at time t for ever."""
     return jax.tree_util.Partial(_held_unless, law, t, moves)
 

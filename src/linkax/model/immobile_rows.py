@@ -6,24 +6,31 @@ vector along n fixed. Such a row is constant; it is checked where violations are
 left out of all equations.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
+from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import Constant
+from linkax.model.topology import SpanningTree
 
 PARALLEL = 1e-14
-EVERY_ROW = (lambda i, j: True), (lambda i: True)
+Orientations = dict[str, np.ndarray | None]  # of bodies at coordinate zero; None where traced
+Tests = tuple[Callable[[int, int], bool], Callable[[int], bool]]
+EVERY_ROW: Tests = (lambda i, j: True), (lambda i: True)
 
 
-def split_rows(carriers, predecessors, cuts, all_rows=False) -> dict[str, tuple]:
+def split_rows(tree: SpanningTree, all_rows: bool = False) -> dict[str, tuple]:
     """The rows of all cut joints, those that move and those that do not (see `Topology`); or all as if they moved."""
-    orientation, carrier_of = {GROUND_NAME: np.eye(3)}, {}
-    for joint, predecessor in zip(carriers, predecessors, strict=True):
+    orientation: Orientations = {GROUND_NAME: np.eye(3)}
+    carrier_of: dict[str, tuple[AbstractJoint, str]] = {}
+    for joint, predecessor in zip(tree.carriers, tree.predecessors, strict=True):
         body = joint.child.body if joint.parent.body == predecessor else joint.parent.body
         orientation[body] = _carried(joint, predecessor, orientation[predecessor])
         carrier_of[body] = (joint, predecessor)
     rows = {"rotation_rows": [], "translation_rows": [], "immobile_rotation_rows": [], "immobile_translation_rows": []}
-    for index, cut in enumerate(cuts):
+    for index, cut in enumerate(tree.cuts):
         rotates, translates = EVERY_ROW if all_rows else _mobile(cut, _loop(cut, carrier_of), orientation)
         for i, j in cut.locked_rotations:
             rows["rotation_rows" if rotates(i, j) else "immobile_rotation_rows"].append((index, i, j))
@@ -32,7 +39,7 @@ def split_rows(carriers, predecessors, cuts, all_rows=False) -> dict[str, tuple]
     return {name: tuple(found) for name, found in rows.items()}
 
 
-def _carried(joint, predecessor, orientation):
+def _carried(joint: AbstractJoint, predecessor: str, orientation: np.ndarray | None) -> np.ndarray | None:
     """Orientation of a body at coordinate zero, or None where it is traced."""
     if orientation is None or not _is_structure(joint):
         return None
@@ -41,14 +48,14 @@ def _carried(joint, predecessor, orientation):
     return orientation @ (turn if joint.parent.body == predecessor else turn.T)
 
 
-def _is_structure(joint):
+def _is_structure(joint: AbstractJoint) -> bool:
     return all(isinstance(part, Constant) for part in (joint.axis, joint.parent.rotation, joint.child.rotation))
 
 
-def _loop(cut, carrier_of):
+def _loop(cut: AbstractJoint, carrier_of: dict[str, tuple[AbstractJoint, str]]) -> list[AbstractJoint]:
     """The tree joints on one of the two ways from ground to the cut joint, but not on both."""
 
-    def way(body):
+    def way(body: str) -> dict[str, AbstractJoint]:
         joints = {}
         while body != GROUND_NAME:
             joint, body = carrier_of[body]
@@ -59,21 +66,20 @@ def _loop(cut, carrier_of):
     return [(parents | children)[name] for name in parents.keys() ^ children.keys()]
 
 
-def _mobile(cut, loop, orientation):
+def _mobile(cut: AbstractJoint, loop: list[AbstractJoint], orientation: Orientations) -> Tests:
     """Two tests, whether the loop's motion changes h₁ⁱ·h₂ʲ and h₁ⁱ·s."""
-    if any(not _is_structure(joint) or orientation[joint.parent.body] is None for joint in [cut, *loop]):
-        return EVERY_ROW
-    if orientation[cut.child.body] is None:
+    joints, child = [cut, *loop], orientation[cut.child.body]
+    parents = [parent for joint in joints if (parent := orientation[joint.parent.body]) is not None]
+    if child is None or len(parents) < len(joints) or not all(map(_is_structure, joints)):
         return EVERY_ROW
     turns, slides = [], []
-    for joint in [cut, *loop]:
-        axes = orientation[joint.parent.body] @ joint.frames()[0]
+    for joint, parent in zip(joints, parents, strict=True):
+        axes = parent @ joint.frames()[0]
         turns += [axes @ column for column in np.array(joint.angular_subspace) if np.any(column)]
         slides += [axes @ column for column in np.array(joint.linear_subspace) if np.any(column)]
     if turns and any(np.linalg.norm(np.cross(turns[0], turn)) > PARALLEL for turn in turns):
         return EVERY_ROW
-    parent_axes = orientation[cut.parent.body] @ cut.frames()[0]
-    child_axes = orientation[cut.child.body] @ cut.frames()[1]
+    parent_axes, child_axes = parents[0] @ cut.frames()[0], child @ cut.frames()[1]
 
     def fixed(direction):
         return not turns or np.linalg.norm(np.cross(turns[0], direction)) <= PARALLEL

@@ -1,19 +1,22 @@
 """A mechanism: bodies, joints, constraints and forces, checked, with its spanning tree."""
 
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 
-from linkax.model.beams import Beam, discretise_beams, held_first
-from linkax.model.bodies import GROUND_NAME, RigidBody
+from linkax.model.beams import Beam
+from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
 from linkax.model.constraints import AbstractConstraint
+from linkax.model.discretisation import Parts, discretise_beams, tree_joints_first
 from linkax.model.forces import AbstractForce
 from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import listed, require_bool
-from linkax.model.topology import GROUND_INDEX, Topology, spanning_tree
+from linkax.model.topology import GROUND_INDEX, SpanningTree, Topology, spanning_tree
 
 
 class Mechanism(eqx.Module):
@@ -45,56 +48,25 @@ class Mechanism(eqx.Module):
     constraints: tuple[AbstractConstraint, ...]
     topology: Topology = eqx.field(static=True)
 
-    def __init__(self, bodies, joints, forces=(), constraints=(), *, all_rows=False):
-        related = "give a list of Coupling, Drive, Rope or Distance"
-        constraints = listed(constraints, (AbstractConstraint, Distance), "constraints", related)
-        joints = listed(joints, AbstractJoint, "joints", "give a list of Revolute, Prismatic and their like")
-        joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
-        constraints = [c for c in constraints if not isinstance(c, Distance)]
-        bodies = listed(bodies, (RigidBody, Beam), "bodies", "give a list of RigidBody or Beam")
-        if not bodies:
-            raise ValueError("bodies is empty, []; give at least one body")
-        forces = listed(forces, AbstractForce, "forces", "give a list of Gravity, Spring and their like")
-        beams = [body for body in bodies if isinstance(body, Beam)]
-        bodies, joints, forces, constraints = discretise_beams(bodies, joints, forces, constraints)
-        by_name, joint_by_name = _by_name(bodies, "body"), _by_name(joints, "joint")
-        _by_name([*joints, *constraints], "joint or constraint")
-        _check_references(by_name, joint_by_name, constraints, forces)
-        related = {name for constraint in constraints for name in constraint.joints}
-        acted_on = {name for force in forces for name in force.joints}
-        first = [*held_first(joints), related, acted_on]
-        order, carriers, predecessors, cuts = spanning_tree(list(by_name), joints, first)
-        for joint in cuts:
-            if isinstance(joint, OnBeam):
-                raise ValueError(
-                    f"joint {joint.name!r} slides along a beam and closes a loop; put a massless body on it, and close "
-                    "the loop by another joint on that body"
-                )
-        for name in related & {joint.name for joint in cuts}:
-            of_joint = ", ".join(repr(c.name) for c in constraints if name in c.joints)
-            raise ValueError(
-                f"constraint {of_joint} relates joint {name!r}, which is cut, and whose angle therefore does not count "
-                "turns; remove cut=True, or relate fewer joints of this loop"
-            )
-        self.bodies = tuple(by_name[name] for name in order)
-        self.beams = tuple(beams)
-        self.joints = (*carriers, *cuts)
-        self.forces = tuple(forces)
-        self.constraints = tuple(constraints)
-        index = {GROUND_NAME: GROUND_INDEX} | {name: position for position, name in enumerate(order)}
-        self.topology = Topology(
-            bodies=tuple(order),
-            joints=tuple(joint.name for joint in self.joints),
-            predecessor=tuple(index[name] for name in predecessors),
-            parent=tuple(index[joint.parent.body] for joint in self.joints),
-            child=tuple(index[joint.child.body] for joint in self.joints),
-            joint_types=tuple(joint.kind for joint in self.joints),
-            driven_by=tuple(joint.driven_by for joint in self.joints),
-            **split_rows(carriers, predecessors, cuts, require_bool(all_rows, "all_rows")),
-            constraints=tuple(constraint.name for constraint in constraints),
-            constraint_terms=tuple(constraint.terms for constraint in constraints),
-            constraint_bodies=tuple(tuple(index[f.body] for f in constraint.frames) for constraint in constraints),
-        )
+    def __init__(
+        self,
+        bodies: Iterable[RigidBody | Beam],
+        joints: Iterable[AbstractJoint],
+        forces: Iterable[AbstractForce] = (),
+        constraints: Iterable[AbstractConstraint | Distance] = (),
+        *,
+        all_rows: bool = False,
+    ):
+        given = _listed(bodies, joints, forces, constraints)
+        parts = discretise_beams(*given)
+        body_by_name = _check_names(parts)
+        tree = _spanning_tree(list(body_by_name), parts)
+        self.bodies = tuple(body_by_name[name] for name in tree.bodies)
+        self.beams = tuple(body for body in given[0] if isinstance(body, Beam))
+        self.joints = (*tree.carriers, *tree.cuts)
+        self.forces = tuple(parts.forces)
+        self.constraints = tuple(parts.constraints)
+        self.topology = _topology(tree, parts.constraints, require_bool(all_rows, "all_rows"))
 
     def with_all_rows(self) -> "Mechanism":
         """The same mechanism with those loop rows too that no motion changes (see `all_rows`)."""
@@ -111,26 +83,93 @@ class Mechanism(eqx.Module):
         return self.joints[_find(name, self.topology.joints, "joint")]
 
 
-def _find(name, names, what):
+def _find(name: Any, names: tuple[str, ...], what: str) -> int:
     if not isinstance(name, str) or name not in names:
         raise ValueError(f"unknown {what} {name!r}; known: {', '.join(map(repr, names))}")
     return names.index(name)
 
 
-def _by_name(elements, what):
+def _listed(
+    bodies: Any, joints: Any, forces: Any, constraints: Any
+) -> tuple[list[RigidBody | Beam], list[AbstractJoint], list[AbstractForce], list[AbstractConstraint]]:
+    """What a user gives as lists, checked. A `Distance` among the constraints goes to the joints."""
+    remedy = "give a list of Coupling, Drive, Rope or Distance"
+    constraints = listed(constraints, (AbstractConstraint, Distance), "constraints", remedy)
+    joints = listed(joints, AbstractJoint, "joints", "give a list of Revolute, Prismatic and their like")
+    joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
+    constraints = [c for c in constraints if not isinstance(c, Distance)]
+    bodies = listed(bodies, (RigidBody, Beam), "bodies", "give a list of RigidBody or Beam")
+    if not bodies:
+        raise ValueError("bodies is empty, []; give at least one body")
+    forces = listed(forces, AbstractForce, "forces", "give a list of Gravity, Spring and their like")
+    return bodies, joints, forces, constraints
+
+
+def _check_names(parts: Parts) -> dict[str, RigidBody]:
+    """The bodies by name, where all names are unique and all that elements refer to is there."""
+    bodies, joints = _by_name(parts.bodies, "body"), _by_name(parts.joints, "joint")
+    _by_name([*parts.joints, *parts.constraints], "joint or constraint")
+    _check_references(bodies, joints, parts.constraints, parts.forces)
+    return bodies
+
+
+def _spanning_tree(bodies: list[str], parts: Parts) -> SpanningTree:
+    """The tree, with joints in it that a constraint relates or a force acts along, where they can be."""
+    related = {name for constraint in parts.constraints for name in constraint.joints}
+    acted_on = {name for force in parts.forces for name in force.joints}
+    tree = spanning_tree(bodies, parts.joints, [*tree_joints_first(parts.joints), related, acted_on])
+    for joint in tree.cuts:
+        if isinstance(joint, OnBeam):
+            raise ValueError(
+                f"joint {joint.name!r} slides along a beam and closes a loop; put a massless body on it, and close "
+                "the loop by another joint on that body"
+            )
+    for name in related & {joint.name for joint in tree.cuts}:
+        of_joint = ", ".join(repr(c.name) for c in parts.constraints if name in c.joints)
+        raise ValueError(
+            f"constraint {of_joint} relates joint {name!r}, which is cut, and whose angle therefore does not count "
+            "turns; remove cut=True, or relate fewer joints of this loop"
+        )
+    return tree
+
+
+def _topology(tree: SpanningTree, constraints: list[AbstractConstraint], all_rows: bool) -> Topology:
+    joints = [*tree.carriers, *tree.cuts]
+    index = {GROUND_NAME: GROUND_INDEX} | {name: position for position, name in enumerate(tree.bodies)}
+    return Topology(
+        bodies=tuple(tree.bodies),
+        joints=tuple(joint.name for joint in joints),
+        predecessor=tuple(index[name] for name in tree.predecessors),
+        parent=tuple(index[joint.parent.body] for joint in joints),
+        child=tuple(index[joint.child.body] for joint in joints),
+        joint_types=tuple(joint.kind for joint in joints),
+        driven_by=tuple(joint.driven_by for joint in joints),
+        **split_rows(tree, all_rows),
+        constraints=tuple(constraint.name for constraint in constraints),
+        constraint_terms=tuple(constraint.terms for constraint in constraints),
+        constraint_bodies=tuple(tuple(index[f.body] for f in constraint.frames) for constraint in constraints),
+    )
+
+
+def _by_name(elements: Sequence[Any], what: str) -> dict[str, Any]:
     for name, count in Counter(element.name for element in elements).items():
         if count > 1:
             raise ValueError(f"{what} {name!r} appears {count} times; give each {what} a name of its own")
     return {element.name: element for element in elements}
 
 
-def _check_references(bodies, joints, constraints, forces):
-    def check_frames(what, frames):
+def _check_references(
+    bodies: Mapping[str, RigidBody],
+    joints: Mapping[str, AbstractJoint],
+    constraints: Sequence[AbstractConstraint],
+    forces: Sequence[AbstractForce],
+) -> None:
+    def check_frames(what: str, frames: Sequence[Frame]) -> None:
         for frame in frames:
             if frame.body not in bodies and frame.body != GROUND_NAME:
                 raise ValueError(f"{what} attaches to body {frame.body!r}, which is not in bodies; add it there")
 
-    def check_joint(what, name):
+    def check_joint(what: str, name: str) -> None:
         if name not in joints:
             raise ValueError(f"{what} acts along unknown joint {name!r}; known: {', '.join(map(repr, joints))}")
 
@@ -148,7 +187,7 @@ def _check_references(bodies, joints, constraints, forces):
             _check_index(constraint.display_name, joints[name], index, True)
 
 
-def _check_index(what, joint, index, needs_coordinate):
+def _check_index(what: str, joint: AbstractJoint, index: int | None, needs_coordinate: bool) -> None:
     """Whether a joint has a speed of that index, and if need be a coordinate whose rate it is."""
     count = len(joint.speed_units)
     kind = f"joint {joint.name!r}, a {type(joint).__name__}"

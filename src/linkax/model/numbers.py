@@ -5,15 +5,31 @@ transformation are not known: one that cannot be becomes NaN (`require`), so tha
 """
 
 import numbers
+from collections.abc import Callable, Sequence
 from functools import partial
+from types import ModuleType
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Float
 
 from linkax.spatial.rotations import COORDINATE_AXES
+from linkax.xla.arrays import Array, Scalar
+from linkax.xla.tracing import concrete
+
+# What a user may give for a number, for several, for a matrix, and for a direction (by name, as "-x").
+Number = float | int | np.number | Array
+Vector = Array | Sequence[Number]
+Matrix = Array | Sequence[Number] | Sequence[Vector]
+Axis = str | Vector
+
+Kind = TypeVar("Kind")
+Word = TypeVar("Word", bound=str)
+Kinds = type | tuple[type, ...]
 
 
 class Constant(eqx.Module):
@@ -21,7 +37,7 @@ class Constant(eqx.Module):
 
     entries: tuple = eqx.field(static=True)
 
-    def __init__(self, array):
+    def __init__(self, array: np.ndarray):
         self.entries = _as_tuples(np.asarray(array, dtype=np.float64).tolist())
 
     @property
@@ -29,26 +45,21 @@ class Constant(eqx.Module):
         return np.array(self.entries, dtype=np.float64)
 
 
-def _as_tuples(nested):
+def _as_tuples(nested: Any) -> Any:
     return tuple(map(_as_tuples, nested)) if isinstance(nested, list) else nested
 
 
-def value(entry):
+def value(entry: Constant | Array) -> Array:
     """The array behind a `Constant`, or the traced array itself."""
     return entry.array if isinstance(entry, Constant) else entry
 
 
-def concrete(number) -> np.ndarray | None:
-    """The number as a NumPy array, or None while it is traced by a transformation."""
-    return None if isinstance(number, jax.core.Tracer) else np.asarray(number)
-
-
-def namespace(*arrays):
+def namespace(*arrays: Array | np.floating) -> ModuleType:
     """NumPy for arrays whose values are known, or jax.numpy where one is traced."""
     return np if all(concrete(array) is not None for array in arrays) else jnp
 
 
-def number(entry, shape: tuple[int, ...], what: str):
+def number(entry: Any, shape: tuple[int, ...], what: str) -> Float[Array, "..."]:
     """A traced leaf of the given shape in double precision; `what` names it in errors."""
     array = real(entry, what)
     if array.shape != shape:
@@ -57,18 +68,18 @@ def number(entry, shape: tuple[int, ...], what: str):
     return require(array, is_finite, what, "it must be finite")
 
 
-def is_finite(array):
+def is_finite(array: Array) -> Any:
     """Whether all numbers of an array are."""
     known = concrete(array)
     return jnp.isfinite(array).all() if known is None else np.isfinite(known).all()
 
 
-def real(entry, what: str):
+def real(entry: Any, what: str) -> Float[Array, "..."]:
     """Real numbers of any shape, in double precision; neither text, booleans nor None are taken for numbers."""
     return converted(entry, what, _in_double)
 
 
-def _in_double(entry):
+def _in_double(entry: Any) -> Array:
     if isinstance(entry, jax.Array):
         return jnp.asarray(entry, dtype=float)
     if any(isinstance(part, jax.Array) for part in jax.tree.leaves(entry)):
@@ -78,7 +89,7 @@ def _in_double(entry):
     return array
 
 
-def converted(entry, what: str, convert):
+def converted(entry: Any, what: str, convert: Callable[[Any], Kind]) -> Kind:
     """What `convert` makes of an entry that holds real numbers alone."""
     try:
         if not all(map(_is_real, jax.tree.leaves(entry, is_leaf=lambda part: part is None))):
@@ -90,7 +101,7 @@ def converted(entry, what: str, convert):
         ) from error
 
 
-def _is_real(part) -> bool:
+def _is_real(part: Any) -> bool:
     if np.ma.is_masked(part):
         return False
     if getattr(part, "dtype", np.dtype(object)) == np.dtype(object):
@@ -102,35 +113,35 @@ def _is_real(part) -> bool:
 MOST = 2**31 - 1  # that counts may be
 
 
-def whole_number(entry, what: str, least: int = 1, most: int = MOST) -> int:
+def whole_number(entry: Any, what: str, least: int = 1, most: int = MOST) -> int:
     """An integer from `least` to `most`."""
     if isinstance(entry, bool) or not isinstance(entry, int | np.integer) or not least <= entry <= most:
         raise ValueError(f"{what} is {entry!r}; it must be an integer of at least {least} and at most {most}")
     return int(entry)
 
 
-def require_bool(entry, what: str) -> bool:
+def require_bool(entry: Any, what: str) -> bool:
     """True or False."""
     if not isinstance(entry, bool | np.bool_):
         raise ValueError(f"{what} is {entry!r}; give True or False")
     return bool(entry)
 
 
-def one_of(entry, choices: tuple[str, ...], what: str) -> str:
+def one_of(entry: Word, choices: tuple[Word, ...], what: str) -> Word:
     """One of several words."""
     if not isinstance(entry, str) or entry not in choices:
         raise ValueError(f"{what} is {entry!r}; known: {', '.join(map(repr, choices))}")
     return entry
 
 
-def require_type(entry, kind, what: str, remedy: str):
+def require_type(entry: Any, kind: Kinds, what: str, remedy: str) -> Any:
     """Something of a kind, or of one of several."""
     if not isinstance(entry, kind):
         raise ValueError(f"{what} is {entry!r}; {remedy}")
     return entry
 
 
-def listed(entries, kind, what: str, remedy: str) -> list:
+def listed(entries: Any, kind: Kinds, what: str, remedy: str) -> list[Any]:
     """A list of things of a kind, or of one of several."""
     try:
         found = list(entries)
@@ -139,7 +150,7 @@ def listed(entries, kind, what: str, remedy: str) -> list:
     return [require_type(entry, kind, f"an entry of {what}", remedy) for entry in found]
 
 
-def require(array, condition, what: str, remedy: str):
+def require(array: Array, condition: Callable[[Array], Any], what: str, remedy: str) -> Array:
     """An array that meets a condition.
 
     Where the condition is known, it raises a ValueError if it fails; where it is traced, an array that fails it is
@@ -150,21 +161,21 @@ def require(array, condition, what: str, remedy: str):
     if concrete(met) is None:
         return jnp.where(met, array, jnp.nan)
     if not met:
-        raise ValueError(f"{what} is {known.tolist()}; {remedy}")
+        raise ValueError(f"{what} is {np.asarray(array).tolist()}; {remedy}")
     return array
 
 
-def positive(entry, what: str, remedy: str = "it must be positive"):
+def positive(entry: Any, what: str, remedy: str = "it must be positive") -> Scalar:
     """A positive number."""
     return require(number(entry, (), what), lambda x: x > 0.0, what, remedy)
 
 
-def zero_or_more(entry, what: str):
+def zero_or_more(entry: Any, what: str) -> Scalar:
     """A number that is not negative."""
     return require(number(entry, (), what), lambda x: x >= 0.0, what, "it must be zero or more")
 
 
-def unit_axis(axis, what: str):
+def unit_axis(axis: Axis, what: str) -> Constant | Float[Array, "3"]:
     """A unit vector from a name ("x", "-z"), numbers (structure), or a JAX array (traced)."""
     if isinstance(axis, str):
         if axis not in COORDINATE_AXES:
@@ -177,16 +188,18 @@ def unit_axis(axis, what: str):
     return Constant(unit) if isinstance(vector, np.ndarray) else unit
 
 
-def _norm(vector):
+def _norm(vector: Array) -> Any:
     with np.errstate(over="ignore", under="ignore"):
         return np.linalg.norm(vector) if isinstance(vector, np.ndarray) else jnp.linalg.norm(vector)
 
 
-def _is_length(length):
+def _is_length(length: Any) -> Any:
     return (length > 0.0) & (length < np.inf)
 
 
-def perpendicular_axes(first, axis, what: str):
+def perpendicular_axes(
+    first: Constant | Float[Array, "3"], axis: Axis, what: str
+) -> tuple[Constant | Float[Array, "3"], Constant | Float[Array, "3"]]:
     """Two unit vectors, the first as `unit_axis` made it, the second from `axis` and checked to be at a right angle."""
     second = unit_axis(axis, what)
     one, other = value(first), value(second)
@@ -199,7 +212,7 @@ def perpendicular_axes(first, axis, what: str):
     return mark(first), mark(second)
 
 
-def rotation_matrix(rotation, what: str):
+def rotation_matrix(rotation: Matrix | None, what: str) -> Constant | Float[Array, "3 3"]:
     """A rotation: None (identity) and numbers are structure, a JAX array is traced."""
     if rotation is None:
         return Constant(np.eye(3))
@@ -208,6 +221,6 @@ def rotation_matrix(rotation, what: str):
     return Constant(matrix) if isinstance(matrix, np.ndarray) else matrix
 
 
-def _is_rotation(matrix):
+def _is_rotation(matrix: Array) -> Any:
     xp = namespace(matrix)
     return xp.allclose(matrix @ matrix.T, np.eye(3), atol=1e-9) & (xp.linalg.det(matrix) > 0.0)

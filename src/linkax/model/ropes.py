@@ -1,49 +1,53 @@
 """Ropes over points of bodies: of a given length, or elastic."""
 
+from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from linkax.model.bodies import AbstractBody, Frame, frame_of
+from linkax.model.bodies import AbstractBody, BodyOrFrame, Frame, frame_of
 from linkax.model.constraints import AbstractConstraint, checked_name
+from linkax.model.elements import Configuration, Motion
 from linkax.model.forces import AbstractForce, Load
 from linkax.model.functions import Law, evaluated, held_unless
-from linkax.model.numbers import listed, positive, zero_or_more
+from linkax.model.numbers import Number, listed, positive, zero_or_more
 from linkax.spatial.vectors import dot, length
+from linkax.xla.arrays import Array, Scalar
 
 Points = tuple[Frame, ...]
 
 
-def _points(points, what) -> Points:
+def _points(points: Sequence[BodyOrFrame], what: str) -> Points:
     remedy = "give a list of bodies, body.at(...), or lx.GROUND.at(...)"
-    points = listed(points, (AbstractBody, Frame), f"{what}: points", remedy)
-    points = tuple(frame_of(point, f"{what}: a point") for point in points)
-    if len(points) < 2:
-        raise ValueError(f"{what} has {len(points)} points; give two or more, in the order of the rope")
-    if len({point.body for point in points}) == 1:
-        raise ValueError(f"{what}: its points are all on body {points[0].body!r}; give points on two bodies or more")
-    return points
+    given = listed(points, (AbstractBody, Frame), f"{what}: points", remedy)
+    frames = tuple(frame_of(point, f"{what}: a point") for point in given)
+    if len(frames) < 2:
+        raise ValueError(f"{what} has {len(frames)} points; give two or more, in the order of the rope")
+    if len({frame.body for frame in frames}) == 1:
+        raise ValueError(f"{what}: its points are all on body {frames[0].body!r}; give points on two bodies or more")
+    return frames
 
 
-def _spans(configuration, points: Points) -> Float[Array, "n 3"]:
+def _spans(configuration: Configuration, points: Points) -> Float[jax.Array, "n 3"]:
     """From each point to the next [m]."""
     ends = pairwise(points)
     return jnp.stack([configuration.between(first, second) for first, second in ends])
 
 
-def _directions(spans):
+def _directions(spans: Float[jax.Array, "n 3"]) -> Float[jax.Array, "n 3"]:
     size = length(spans)
     return spans / jnp.where(size > 0.0, size, 1.0)[:, None]
 
 
-def _rate(motion, points: Points) -> Float[Array, "n 3"]:
+def _rate(motion: Motion, points: Points) -> Float[Array, "n 3"]:
     velocity = jnp.stack([motion.point_velocity(point) for point in points])
     return velocity[1:] - velocity[:-1]
 
 
-def _pull(configuration, points: Points, tension) -> Load:
+def _pull(configuration: Configuration, points: Points, tension: Scalar) -> Load:
     """What a rope does to its points."""
     forces = tension * _directions(_spans(configuration, points))
     total = Load.none(configuration.system)
@@ -70,9 +74,9 @@ class Rope(AbstractConstraint):
     """
 
     points: Points
-    length: Float[Array, ""] | Law
+    length: Scalar | Law
 
-    def __init__(self, name: str, points, length):
+    def __init__(self, name: str, points: Sequence[BodyOrFrame], length: Number | Callable[[Any], Number]):
         self.name = checked_name(name, "rope")
         self.points = _points(points, f"rope {name!r}")
         if callable(length):
@@ -82,31 +86,31 @@ class Rope(AbstractConstraint):
             self.length = positive(length, f"rope {name!r}: length [m]")
 
     @property
-    def frames(self):
+    def frames(self) -> tuple[Frame, ...]:
         return self.points
 
     @property
-    def is_driven(self):
+    def is_driven(self) -> bool:
         return isinstance(self.length, Law)
 
-    def right_side(self, t):
+    def right_side(self, t: Number) -> Scalar:
         return -evaluated(self.length, t)
 
-    def held(self, t, unless=False):
-        if not self.is_driven:
+    def held(self, t: Number, unless: Any = False) -> "Rope":
+        if not isinstance(self.length, Law):
             return self
         length = evaluated(self.length, t) if unless is False else held_unless(self.length, t, unless)
         return Rope(self.name, self.points, length)
 
-    def value(self, configuration):
+    def value(self, configuration: Configuration) -> Scalar:
         """Minus its length: rows are such that their multipliers are tensions."""
         return -jnp.sum(length(_spans(configuration, self.points)))
 
-    def load(self, configuration, tension) -> Load:
+    def load(self, configuration: Configuration, tension: Scalar) -> Load:
         """What it does to its points."""
         return _pull(configuration, self.points, tension)
 
-    def bias(self, motion) -> Float[Array, ""]:
+    def bias(self, motion: Motion) -> Scalar:
         """The acceleration of its length that velocities alone cause [m/s²]."""
         spans, rate = _spans(motion.configuration, self.points), _rate(motion, self.points)
         points = jnp.stack([motion.point_bias(point) for point in self.points])
@@ -125,37 +129,37 @@ class ElasticRope(AbstractForce):
     """
 
     points: Points
-    stiffness: Float[Array, ""]
-    free_length: Float[Array, ""]
-    damping: Float[Array, ""]
+    stiffness: Scalar
+    free_length: Scalar
+    damping: Scalar
 
-    def __init__(self, points, stiffness, free_length, damping=0.0):
+    def __init__(self, points: Sequence[BodyOrFrame], stiffness: Number, free_length: Number, damping: Number = 0.0):
         self.points = _points(points, "ElasticRope")
         self.stiffness = positive(stiffness, f"{self.display_name}: stiffness [N/m]")
         self.free_length = positive(free_length, f"{self.display_name}: free_length [m]")
         self.damping = zero_or_more(damping, f"{self.display_name}: damping [N s/m]")
 
     @property
-    def frames(self):
+    def frames(self) -> tuple[Frame, ...]:
         return self.points
 
-    def _stretch(self, configuration):
+    def _stretch(self, configuration: Configuration) -> Scalar:
         return jnp.sum(length(_spans(configuration, self.points))) - self.free_length
 
-    def _rate_of_stretch(self, motion):
+    def _rate_of_stretch(self, motion: Motion) -> Scalar:
         along = _directions(_spans(motion.configuration, self.points))
         return jnp.sum(dot(along, _rate(motion, self.points)))
 
-    def switch(self, t, motion):
+    def switch(self, t: Number, motion: Motion) -> Scalar:
         """Positive where it is taut: longer than free, and not shortening so fast that damping takes all its pull."""
         stretch = self._stretch(motion.configuration)
         slower = self.damping / self.stiffness * self._rate_of_stretch(motion)
         return (stretch + jnp.minimum(slower, 0.0)) / self.free_length
 
-    def load(self, t, motion, on):
+    def load(self, t: Number, motion: Motion, on: Any) -> Load:
         stretch, rate = self._stretch(motion.configuration), self._rate_of_stretch(motion)
         tension = self.stiffness * stretch + self.damping * rate
         return _pull(motion.configuration, self.points, jnp.where(on, tension, 0.0))
 
-    def potential_energy(self, configuration):
+    def potential_energy(self, configuration: Configuration) -> Scalar:
         return self.stiffness * jnp.maximum(self._stretch(configuration), 0.0) ** 2 / 2.0

@@ -1,13 +1,15 @@
 """Cross-sections of beams: from stiffnesses, or from a profile and a material."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from linkax.model.numbers import namespace, number, positive, real, require, require_type
+from linkax.model.numbers import Number, Vector, namespace, number, positive, real, require, require_type
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
 GIVE_MATERIAL = "give a lx.Material(youngs_modulus, poissons_ratio, density)"
@@ -21,11 +23,11 @@ class Material(eqx.Module):
     **Raises:** `ValueError` for a modulus or a density that is not positive, and for ν outside (−1, 0.5].
     """
 
-    youngs_modulus: Float[Array, ""]
-    poissons_ratio: Float[Array, ""]
-    density: Float[Array, ""]
+    youngs_modulus: Scalar
+    poissons_ratio: Scalar
+    density: Scalar
 
-    def __init__(self, youngs_modulus, poissons_ratio, density):
+    def __init__(self, youngs_modulus: Number, poissons_ratio: Number, density: Number):
         self.youngs_modulus = positive(youngs_modulus, "material: youngs_modulus [Pa]")
         what = "material: poissons_ratio"
         ratio = number(poissons_ratio, (), what)
@@ -33,7 +35,7 @@ class Material(eqx.Module):
         self.density = positive(density, "material: density [kg/m³]")
 
     @property
-    def shear_modulus(self) -> Float[Array, ""]:
+    def shear_modulus(self) -> Scalar:
         """G = E / 2(1 + ν) [Pa]."""
         return self.youngs_modulus / (2.0 * (1.0 + self.poissons_ratio))
 
@@ -57,20 +59,20 @@ class Section(eqx.Module):
     """
 
     bending_stiffness: Float[Array, "2"]
-    linear_density: Float[Array, ""]
-    axial_stiffness: Float[Array, ""] | None
-    torsional_stiffness: Float[Array, ""] | None
+    linear_density: Scalar
+    axial_stiffness: Scalar | None
+    torsional_stiffness: Scalar | None
     shear_stiffness: Float[Array, "2"] | None
     rotary_inertia: Float[Array, "2"]
 
     def __init__(
         self,
-        bending_stiffness,
-        linear_density,
-        axial_stiffness=None,
-        torsional_stiffness=None,
-        shear_stiffness=None,
-        rotary_inertia=None,
+        bending_stiffness: Number | Vector,
+        linear_density: Number,
+        axial_stiffness: Number | None = None,
+        torsional_stiffness: Number | None = None,
+        shear_stiffness: Number | Vector | None = None,
+        rotary_inertia: Number | Vector | None = None,
     ):
         self.bending_stiffness = _both(bending_stiffness, "section: bending_stiffness [N m²]")
         self.linear_density = positive(linear_density, "section: linear_density [kg/m]")
@@ -87,7 +89,7 @@ class Section(eqx.Module):
         else:
             self.rotary_inertia = np.zeros(2)
 
-    def stiffness(self, strain: int):
+    def stiffness(self, strain: int) -> Scalar | None:
         """The stiffness against one component of strain: twist, bending about y and z, stretch, shear along y and z."""
         of_strain = [
             self.torsional_stiffness,
@@ -100,17 +102,23 @@ class Section(eqx.Module):
         return of_strain[strain]
 
 
-def _pair(entry, what):
+def _pair(entry: Any, what: str) -> Float[Array, "2"]:
     """Two numbers, or one for both."""
     array = real(entry, what)
     return number(array * np.ones(2) if array.shape == () else array, (2,), what)
 
 
-def _both(entry, what):
+def _both(entry: Any, what: str) -> Float[Array, "2"]:
     return require(_pair(entry, what), lambda x: (x > 0.0).all(), what, "it must be positive")
 
 
-def _of_profile(material, area, second_moments, torsion_constant, shear_coefficients) -> Section:
+def _of_profile(
+    material: Material,
+    area: Scalar,
+    second_moments: tuple[Scalar, Scalar],
+    torsion_constant: Scalar,
+    shear_coefficients: tuple[Scalar, Scalar],
+) -> Section:
     """A section of one material; `second_moments` of area about y and z [m⁴]."""
     young, shear, density = material.youngs_modulus, material.shear_modulus, material.density
     moments = jnp.stack(jnp.broadcast_arrays(*second_moments))
@@ -124,7 +132,7 @@ def _of_profile(material, area, second_moments, torsion_constant, shear_coeffici
     )
 
 
-def _wall(thickness, sizes, what):
+def _wall(thickness: Number, sizes: tuple[Scalar, ...], what: str) -> Scalar:
     """The thickness of walls that fit into a profile of these sizes."""
     most = namespace(*sizes).stack(sizes).min() / 2.0
     known_most = "" if concrete(most) is None else f", {float(most)}"
@@ -132,7 +140,7 @@ def _wall(thickness, sizes, what):
     return require(number(thickness, (), what), lambda metres: (metres > 0.0) & (metres < most), what, remedy)
 
 
-def rectangle(width, height, material: Material, thickness=None) -> Section:
+def rectangle(width: Number, height: Number, material: Material, thickness: Number | None = None) -> Section:
     """A rectangular profile, solid or hollow: `width` along y, `height` along z, wall `thickness` [m].
 
     Torsion constant: Bredt's formula for thin walls (Young and Budynas, Roark's Formulas for Stress
@@ -164,7 +172,7 @@ def rectangle(width, height, material: Material, thickness=None) -> Section:
     return _of_profile(material, area, second_moments, torsion, (shears[1], shears[0]))
 
 
-def _box_shear(width, height, ratio):
+def _box_shear(width: Scalar, height: Scalar, ratio: Scalar) -> Scalar:
     """Cowper's shear coefficient of a thin-walled box for a force along its height."""
     n = width / height
     m = n  # × the thickness of the flanges over that of the webs
@@ -173,7 +181,7 @@ def _box_shear(width, height, ratio):
     return 10.0 * (1.0 + ratio) * (1.0 + 3.0 * m) ** 2 / (flanges + across)
 
 
-def circle(diameter, material: Material, thickness=None) -> Section:
+def circle(diameter: Number, material: Material, thickness: Number | None = None) -> Section:
     """A circular profile, solid or a tube: outer `diameter`, wall `thickness` [m].
 
     Shear coefficient: Cowper, Journal of Applied Mechanics 33 (1966).

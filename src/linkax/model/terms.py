@@ -12,7 +12,10 @@ class Term(NamedTuple):
     index: int | None
 
 
-def term(entry, what: str) -> Term:
+TermLike = str | tuple[str, int | None]  # a joint's name, or (name, index of its speed)
+
+
+def term(entry: TermLike, what: str) -> Term:
     """A joint's name, or (name, index), as a user gives it; `what` names the element in errors."""
     joint, index = entry if isinstance(entry, tuple) and len(entry) == 2 else (entry, None)
     whole = isinstance(index, int | np.integer) and not isinstance(index, bool)

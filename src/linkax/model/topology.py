@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections import deque
+from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -98,7 +99,7 @@ class Topology:
         """The speeds of each tree joint in v."""
         return self._slices(lambda kind: len(kind.speed_units))
 
-    def _slices(self, count):
+    def _slices(self, count: Callable[[type[AbstractJoint] | JointKind], int]) -> dict[str, slice]:
         slices, start = {}, 0
         for name, kind in zip(self.joints[: self.num_bodies], self.joint_types, strict=False):
             slices[name] = slice(start, start + count(kind))
@@ -173,17 +174,19 @@ class Topology:
         """The joints in the tree by what their motion is."""
         of_motion = {}
         for body, kind in enumerate(self.joint_types[: self.num_bodies]):
-            alike = (kind, None) if kind.motion is None else (kind.motion, len(self.driven_by[body]))
+            driven_by = self.driven_by[body]
+            alike = (kind, None) if driven_by is None else (kind.motion, len(driven_by))
             of_motion.setdefault(alike, []).append(body)
         return tuple(
             JointGroup(motion, tuple(bodies), self._read_by(bodies)) for (motion, _), bodies in of_motion.items()
         )
 
-    def _read_by(self, bodies):
-        if self.driven_by[bodies[0]] is None:
-            taken = [self.coordinates[self.joints[body]] for body in bodies]
-            return np.array([np.arange(places.start, places.stop) for places in taken], dtype=int)
-        places = [[self.coordinate_slice(term).start for term in self.driven_by[body]] for body in bodies]
+    def _read_by(self, bodies: list[int]) -> np.ndarray:
+        places = []
+        for body in bodies:
+            driven_by, own = self.driven_by[body], self.coordinates[self.joints[body]]
+            terms = [own] if driven_by is None else map(self.coordinate_slice, driven_by)
+            places.append([place for taken in terms for place in range(taken.start, taken.stop)])
         return np.array(places, dtype=int)
 
     @cached_property
@@ -192,7 +195,7 @@ class Topology:
         kinds = self.joint_types[: self.num_bodies]
         return np.array([unit == "m" for kind in kinds for unit in kind.speed_units], dtype=bool)
 
-    def _moving(self, bodies) -> np.ndarray:
+    def _moving(self, bodies: np.ndarray) -> np.ndarray:
         """The speeds that move some of the bodies on their predecessors, (n_b,) not zero."""
         return np.unique(self.motions[bodies[self.moved_body] != 0.0, 1])
 
@@ -259,13 +262,19 @@ class Topology:
         return "\n".join(lines)
 
 
-def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: list[set[str]]):
+class SpanningTree(NamedTuple):
+    """Names of the bodies from ground outwards, the joint and the predecessor that carry each, and the cut joints."""
+
+    bodies: list[str]
+    carriers: list[AbstractJoint]
+    predecessors: list[str]
+    cuts: list[AbstractJoint]
+
+
+def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: list[set[str]]) -> SpanningTree:
     """Choose the tree: joints named in the sets of `first`, in their order, then breadth first from ground.
 
     Joints of types that cannot carry a body are cut always.
-
-    **Returns:** the names of the bodies from ground outwards, the tree joint and the
-    predecessor of each, and the cut joints.
 
     **Raises:** `ValueError` for a body that no joint connects to ground, and for a joint with
     `cut=True` that closes no loop.
@@ -273,7 +282,7 @@ def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: list[se
     ranked = _by_rank([joint for joint in joints if joint.can_carry and not joint.cut], first)
     cluster = {name: name for name in [GROUND_NAME, *bodies]}
 
-    def find(name):
+    def find(name: str) -> str:
         while cluster[name] != name:
             name = cluster[name]
         return name
@@ -293,10 +302,10 @@ def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: list[se
         raise ValueError(f"no joint connects {names} to ground; join each to lx.GROUND or to a body that is joined")
     order, carriers, predecessors = _from_ground(tree)
     in_tree = {joint.name for joint in carriers}
-    return order, carriers, predecessors, [joint for joint in joints if joint.name not in in_tree]
+    return SpanningTree(order, carriers, predecessors, [joint for joint in joints if joint.name not in in_tree])
 
 
-def _neighbours(joints):
+def _neighbours(joints: list[AbstractJoint]) -> dict[str, list[tuple[AbstractJoint, str]]]:
     neighbours = {}
     for joint in joints:
         neighbours.setdefault(joint.parent.body, []).append((joint, joint.child.body))
@@ -304,14 +313,14 @@ def _neighbours(joints):
     return neighbours
 
 
-def _by_rank(joints, first):
+def _by_rank(joints: list[AbstractJoint], first: list[set[str]]) -> list[AbstractJoint]:
     """Those named in the sets of `first`, then those of the breadth-first tree, then the rest."""
     _, carriers, _ = _from_ground(joints)
     sets = [*first, {joint.name for joint in carriers}]
     return sorted(joints, key=lambda joint: [joint.name not in names for names in sets])
 
 
-def _from_ground(joints):
+def _from_ground(joints: list[AbstractJoint]) -> tuple[list[str], list[AbstractJoint], list[str]]:
     """Walk the joints breadth first: bodies in order, the joint and the body that led to each."""
     neighbours, queue = _neighbours(joints), deque([GROUND_NAME])
     reached, carriers, predecessors = {GROUND_NAME: None}, [], []

@@ -1,12 +1,15 @@
 """Motion in closed form that several scenes share: that of a pendulum, swinging or turning."""
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import ellipj, ellipkinc
+
+from linkax.model.numbers import Number, Vector
 
 SLOW = 1e-8  # of k² from one: so close to coming to rest upright, elliptic functions lose their digits
 
 
-def turned_link(times, stiffness, angle, speed) -> np.ndarray | None:
+def turned_link(times: Vector, stiffness: Number, angle: Number, speed: Number) -> Float[np.ndarray, "times 3"] | None:
     """Unit vectors (n, 3) along a link that moves like a pendulum: α̈ = −ω² cos α, α from +x towards +y.
 
     None where it comes too close to rest upright.
@@ -24,14 +27,16 @@ def turned_link(times, stiffness, angle, speed) -> np.ndarray | None:
     return np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
 
 
-def pendulum_angle(times, stiffness, angle, speed) -> np.ndarray | None:
+def pendulum_angle(
+    times: Vector, stiffness: Number, angle: Number, speed: Number
+) -> Float[np.ndarray, " times"] | None:
     """θ(t) of θ̈ = −ω² sin θ, by Jacobi's elliptic functions [rad]; None where it comes too close to rest upright.
 
     Whittaker, Analytical Dynamics of Particles and Rigid Bodies (4th ed.), section 44.
     """
     times = np.asarray(times, dtype=float)
     if stiffness == 0.0:
-        return angle + speed * times
+        return np.asarray(angle + speed * times)
     frequency, turns = np.sqrt(stiffness), np.round(angle / (2.0 * np.pi))
     half = angle / 2.0 - np.pi * turns
     # k² = E / (2 ω²), with the energy counted from the lowest position.

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import operator
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.state import State
 from linkax.xla.tracing import concrete
 
-Parameters = Mapping[str, object]
+Parameters = Mapping[str, Any]  # numbers, some of them traced
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Scene:
             raise ValueError(f"scene {self.name!r} has no variant {name!r}; known: {', '.join(self.variants)}")
         return self.variants[name]
 
-    def settings(self, variant: str | None = None, changes: Parameters | None = None) -> dict[str, object]:
+    def settings(self, variant: str | None = None, changes: Parameters | None = None) -> dict[str, Any]:
         """All parameters: defaults, those of a variant over them, and `changes` over both.
 
         `changes` may hold numbers, traced numbers, or text to be read as numbers.
@@ -88,7 +89,7 @@ class Scene:
         t1 = self.variant(variant).t1
         return self.t1 if t1 is None else t1
 
-    def _checked(self, name, entry):
+    def _checked(self, name: str, entry: Any) -> Any:
         if name not in self.parameters:
             raise ValueError(f"scene {self.name!r} has no parameter {name!r}; known: {', '.join(self.parameters)}")
         read = _count if isinstance(self.parameters[name], int) else _finite
@@ -100,14 +101,14 @@ class Scene:
             raise ValueError(message) from error
 
 
-def _count(entry) -> int:
+def _count(entry: Any) -> int:
     count = int(entry) if isinstance(entry, str) else operator.index(entry)
     if isinstance(entry, bool) or count < 1:
         raise ValueError
     return count
 
 
-def _finite(entry):
+def _finite(entry: Any) -> Any:
     if isinstance(entry, bool):
         raise ValueError
     if concrete(entry) is None or hasattr(entry, "dtype"):

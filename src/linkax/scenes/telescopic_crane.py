@@ -12,10 +12,11 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 import linkax as lx
+from linkax.model.numbers import Number
 from linkax.scenes.scene import Scene, Variant
+from linkax.xla.arrays import Scalar
 
 SECTION = 10.0  # length of each section [m]
 FOOT = (2.0, -1.0)  # of the luffing cylinder, from the boom's pivot [m]
@@ -28,11 +29,11 @@ STEEL = {"poissons_ratio": 0.3, "density": 7850.0}
 class Course(eqx.Module):
     """From one value to another in a time [s], smoothly (a polynomial of fifth degree)."""
 
-    begin: Float[Array, ""]
-    end: Float[Array, ""]
-    duration: Float[Array, ""]
+    begin: Scalar
+    end: Scalar
+    duration: Scalar
 
-    def __call__(self, t):
+    def __call__(self, t: Number) -> Scalar:
         s = jnp.clip(t / self.duration, 0.0, 1.0)
         return self.begin + (self.end - self.begin) * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
@@ -42,11 +43,11 @@ class Reach(eqx.Module):
 
     angle: Course
 
-    def __call__(self, t):
+    def __call__(self, t: Number) -> Scalar:
         return reach(self.angle(t))
 
 
-def reach(angle):
+def reach(angle: Number) -> Scalar:
     """Length of the luffing cylinder at an angle of the boom, unbent [m]."""
     return jnp.hypot(HEAD * jnp.cos(angle) - FOOT[0], HEAD * jnp.sin(angle) - FOOT[1])
 
@@ -59,11 +60,14 @@ def _course(parameters, name):
 def _boom(parameters):
     steel = lx.Material(parameters["modulus"], **STEEL)
     planar = parameters["planes"] == 1
+    profile = lambda index: lx.rectangle(
+        parameters[f"height_{index}"], parameters[f"width_{index}"], steel, parameters["wall"]
+    )
     return [
         lx.Beam(
             f"section_{index}",
             SECTION,
-            lx.rectangle(*(parameters[f"{size}_{index}"] for size in ("height", "width")), steel, parameters["wall"]),
+            profile(index),
             elements=parameters["elements"],
             bends="z" if planar else "yz",
             torsion=not planar,

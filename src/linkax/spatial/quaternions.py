@@ -4,31 +4,34 @@ A quaternion is that of the rotation whose columns are the rotated axes, and q a
 rotation. Smooth everywhere, at no rotation too.
 """
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from linkax.spatial.vectors import cross, dot
+from linkax.xla.arrays import Array
 
 SMALL = 1e-8  # squares of half angles for which two terms of the series are exact
 
 
-def multiply(a, b):
+def multiply(a: Float[Array, "*#batch 4"], b: Float[Array, "*#batch 4"]) -> Float[jax.Array, "... 4"]:
     """The product of two quaternions: the rotation b first, then a."""
     real = a[..., 0] * b[..., 0] - dot(a[..., 1:], b[..., 1:])
     vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + cross(a[..., 1:], b[..., 1:])
     return jnp.concatenate([real[..., None], vector], axis=-1)
 
 
-def conjugate(quaternion):
+def conjugate(quaternion: Float[Array, "*batch 4"]) -> Float[jax.Array, "*batch 4"]:
     """The inverse of a unit quaternion."""
     return jnp.concatenate([quaternion[..., :1], -quaternion[..., 1:]], axis=-1)
 
 
-def normalised(quaternion):
+def normalised(quaternion: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     """The unit quaternion along a nonzero one."""
     return quaternion / jnp.sqrt(dot(quaternion, quaternion))[..., None]
 
 
-def rotation_matrix(quaternion):
+def rotation_matrix(quaternion: Float[Array, "*batch 4"]) -> Float[jax.Array, "*batch 3 3"]:
     """The rotation (..., 3, 3) of a nonzero quaternion of any length."""
     w, x, y, z = (quaternion[..., i] for i in range(4))
     s = 2.0 / dot(quaternion, quaternion)
@@ -40,7 +43,7 @@ def rotation_matrix(quaternion):
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def from_rotation_vector(vector):
+def from_rotation_vector(vector: Float[Array, "*batch 3"]) -> Float[jax.Array, "*batch 4"]:
     """The quaternion of a turn by |vector| [rad] about a vector (..., 3)."""
     half = 0.5 * vector
     square = dot(half, half)
@@ -50,7 +53,7 @@ def from_rotation_vector(vector):
     return jnp.concatenate([real[..., None], ratio[..., None] * half], axis=-1)
 
 
-def rotation_vector(quaternion):
+def rotation_vector(quaternion: Float[Array, "*batch 4"]) -> Float[jax.Array, "*batch 3"]:
     """The shortest turn (..., 3) [rad] that a unit quaternion is; turns by π have two."""
     quaternion = jnp.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
     real, vector = quaternion[..., 0], quaternion[..., 1:]
@@ -60,7 +63,7 @@ def rotation_vector(quaternion):
     return ratio[..., None] * vector
 
 
-def from_rotation_matrix(rotation):
+def from_rotation_matrix(rotation: Float[Array, "*batch 3 3"]) -> Float[jax.Array, "*batch 4"]:
     """The quaternion with w ≥ 0 of a rotation (..., 3, 3), by the largest of its four parts."""
     r = lambda i, j: rotation[..., i, j]
     across = [r(2, 1) - r(1, 2), r(0, 2) - r(2, 0), r(1, 0) - r(0, 1)]

@@ -11,8 +11,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from linkax.spatial.rotations import compose, transpose
+from linkax.xla.arrays import Array
 
 TERMS = 16  # enough for turns of π to rounding
 # (1 − cos a) / a² and (a − sin a) / a³ as power series in a².
@@ -25,7 +27,7 @@ GENERATORS[[3, 4, 5], [0, 1, 2], 3] = 1.0
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _series(order: int, x):
+def _series(order: int, x: Float[Array, "*batch"]) -> Float[jax.Array, "*batch 2"]:
     """Both series, or derivatives of that order, (..., 2); in few operations, whatever the order."""
     coefficients = np.zeros_like(SERIES)
     coefficients[: TERMS - order] = SERIES[order:]
@@ -43,12 +45,12 @@ def _series_jvp(order, primals, changes):
     return _series(order, x), _series(order + 1, x) * change[..., None]
 
 
-def screw_matrix(screw):
+def screw_matrix(screw: Float[Array, "*batch 6"]) -> Float[jax.Array, "*batch 4 4"]:
     """The matrices (..., 4, 4) of screws (..., 6)."""
     return jnp.tensordot(screw, jnp.asarray(GENERATORS, screw.dtype), 1)
 
 
-def exponential(screw):
+def exponential(screw: Float[Array, "*batch 4 4"]) -> Float[jax.Array, "*batch 4 4"]:
     """The motion (Rodrigues) along a constant screw, given as its matrix (..., 4, 4)."""
     square = compose(screw, screw)
     # The trace is −2 a².
@@ -61,7 +63,7 @@ def exponential(screw):
     )
 
 
-def turn_rate(change, rotation):
+def turn_rate(change: Float[Array, "*#batch 3 3"], rotation: Float[Array, "*#batch 3 3"]) -> Float[jax.Array, "... 3"]:
     """The vector (..., 3) of the antisymmetric part of change × rotationᵀ: the angular velocity of a rate of change."""
     across = compose(change, transpose(rotation))
     return jnp.tensordot(across, jnp.asarray(np.swapaxes(LEVI_CIVITA, 0, 2) / 2.0, across.dtype), 2)

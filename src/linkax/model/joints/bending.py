@@ -8,21 +8,21 @@ where strains are constant).
 """
 
 import dataclasses
+from typing import Any, NoReturn
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float, Int
 
+from linkax.model.beams import NUM_STRAINS, Beam
+from linkax.model.bodies import BodyOrFrame, Frame
 from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
 from linkax.model.terms import Term
 from linkax.spatial.rotations import compose
 from linkax.spatial.screws import exponential, screw_matrix
-
-NUM_STRAINS = 6
-# Where an element has its mass, between its nodes: Gauss's rule with two points. (Its error and that of the strains
-# have opposite signs in frequencies; those of Simpson's rule have equal ones.)
-MASS_PLACES = np.array([0.5 - np.sqrt(1.0 / 12.0), 0.5 + np.sqrt(1.0 / 12.0)])
+from linkax.xla.arrays import Array, Scalar
 
 
 def strain_unit(strain: int) -> str:
@@ -30,7 +30,9 @@ def strain_unit(strain: int) -> str:
     return "rad" if strain < 3 else "m"
 
 
-def _along_element(first, second, length, end):
+def _along_element(
+    first: Float[Array, "6"], second: Float[Array, "6"], length: Scalar, end: Scalar
+) -> Float[jax.Array, "4 4"]:
     """The motion from an element's first node to a section.
 
     `first`, `second`: strains at its nodes times its `length`, (6,) each; `end`: where the section is, from 0 to 1.
@@ -42,18 +44,20 @@ def _along_element(first, second, length, end):
     return exponential(middle + _bracket(turned - 20.0 * middle, slope - _bracket(middle, turned) / 60.0) / 240.0)
 
 
-def _bracket(first, second):
+def _bracket(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[jax.Array, "4 4"]:
     """Of screws along which motions follow each other from the left to the right."""
     return compose(second, first) - compose(first, second)
 
 
-def _all_strains(coordinates, strains):
+def _all_strains(coordinates: Float[Array, " n"], strains: tuple[int, ...]) -> Float[jax.Array, "nodes 6"]:
     """All components of strain at nodes, times the element's length, (n, 6), where coordinates are some of them."""
     given = coordinates.reshape(-1, len(strains))
     return jnp.zeros((len(given), NUM_STRAINS), coordinates.dtype).at[:, np.array(strains)].set(given)
 
 
-def section_at(coordinates, strains, length, place):
+def section_at(
+    coordinates: Float[Array, " n"], strains: tuple[int, ...], length: Scalar, place: Scalar
+) -> tuple[Float[jax.Array, "4 4"], Int[jax.Array, ""]]:
     """A section at a place [m], seen from the first node of its element, and which element that is.
 
     `coordinates`: of the whole beam; `strains`: which ones they are; `length`: of an element.
@@ -75,13 +79,14 @@ class WithinElement(RelativeMotion):
 
     strains: tuple[int, ...]
 
-    def __call__(self, coordinates, parameters):
+    def __call__(self, coordinates: Float[Array, " n"], parameters: Float[Array, "4"]) -> Float[jax.Array, "4 4"]:
         length, place, goes_before, goes_behind = parameters
         strains, along = jnp.split(coordinates, [2 * len(self.strains)])
         end = place + jnp.sum(along) / length
         end = jnp.where((end >= 0.0) | (goes_before > 0.0), end, 0.0)
         end = jnp.where((end < 1.0) | (goes_behind > 0.0), end, 1.0)
-        return _along_element(*_all_strains(strains, self.strains), length, end)
+        first, second = _all_strains(strains, self.strains)
+        return _along_element(first, second, length, end)
 
 
 class OnBeam(AbstractJoint):
@@ -98,30 +103,30 @@ class OnBeam(AbstractJoint):
     beam: str = eqx.field(static=True)
     strains: tuple[int, ...] = eqx.field(static=True)
     elements: int = eqx.field(static=True)
-    length: Float[Array, ""]
+    length: Scalar
     element: int = eqx.field(static=True)
 
-    def __init__(self, name, parent, child, beam, element):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, beam: Beam, element: int):
         super().__init__(name, parent, child, "x")
         self.beam, self.strains = beam.name, beam.strains
         self.elements, self.element, self.length = beam.elements, element, beam.element_length
 
     @property
-    def driven_by(self):
+    def driven_by(self) -> tuple[Term, ...]:
         count = len(self.strains)
         return tuple(Term(self.beam, index) for index in range(self.element * count, (self.element + 2) * count))
 
     @property
-    def speed_units(self):
+    def speed_units(self) -> tuple[str, ...]:
         return self.kind.speed_units
 
     @property
-    def angular_subspace(self):
+    def angular_subspace(self) -> tuple[tuple[float, float, float], ...]:
         """The axes about which it can turn its child, see `linkax.model.immobile_rows`."""
         return tuple(map(tuple, np.eye(3)[[strain for strain in self.strains if strain < 3]]))
 
     @property
-    def linear_subspace(self):
+    def linear_subspace(self) -> tuple[tuple[float, float, float], ...]:
         """The directions in which it can move its child, likewise."""
         bends = [strain for strain in self.strains if strain in (1, 2)]
         stretches = [strain - 3 for strain in self.strains if strain >= 3]
@@ -129,11 +134,11 @@ class OnBeam(AbstractJoint):
         return tuple(map(tuple, np.eye(3)[sorted({*stretches, *across, *(0 for _ in bends)})]))
 
     @staticmethod
-    def rotation(coordinates):
+    def rotation(coordinates: Any) -> NoReturn:
         raise NotImplementedError("joints of a beam have a `motion`")
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Any, separation: Any) -> NoReturn:
         raise NotImplementedError("joints of a beam are never cut")
 
 
@@ -143,23 +148,23 @@ class BeamSegment(OnBeam):
     The one that has the beam's name has the strains of all nodes as coordinates.
     """
 
-    place: Float[Array, ""]
+    place: Scalar | float
 
-    def __init__(self, name, parent, child, beam, element, place):
+    def __init__(self, name: str, parent: Frame, child: Frame, beam: Beam, element: int, place: Scalar | float):
         super().__init__(name, parent, child, beam, element)
         self.place = place
 
     @property
-    def kind(self):
+    def kind(self) -> JointKind:
         of_node = tuple(map(strain_unit, self.strains)) if self.name == self.beam else ()
         return JointKind("BeamSegment", WithinElement(self.strains), (self.elements + 1) * of_node)
 
     @property
-    def parameters(self):
+    def parameters(self) -> Float[jax.Array, "4"]:
         return jnp.stack(jnp.broadcast_arrays(self.length, self.place, 1.0, 1.0))
 
     @property
-    def length_estimate(self):
+    def length_estimate(self) -> Scalar:
         return self.length * self.place
 
 
@@ -168,29 +173,29 @@ class SleevePart(OnBeam):
 
     sleeve: str = eqx.field(static=True)
 
-    def __init__(self, name, parent, child, beam, element, sleeve):
+    def __init__(self, name: str, parent: Frame, child: Frame, beam: Beam, element: int, sleeve: str):
         super().__init__(name, parent, child, beam, element)
         self.sleeve = sleeve
 
     @property
-    def kind(self):
+    def kind(self) -> JointKind:
         return JointKind("Sliding", WithinElement(self.strains), ("m",) if self.name == self.sleeve else ())
 
     @property
-    def driven_by(self):
+    def driven_by(self) -> tuple[Term, ...]:
         return (*super().driven_by, Term(self.sleeve, None))
 
     @property
-    def parameters(self):
+    def parameters(self) -> Float[jax.Array, "4"]:
         ends = float(self.element == 0), float(self.element == self.elements - 1)
         return jnp.stack(jnp.broadcast_arrays(self.length, -float(self.element), *ends))
 
     @property
-    def length_estimate(self):
+    def length_estimate(self) -> Scalar:
         return self.length
 
     @property
-    def linear_subspace(self):
+    def linear_subspace(self) -> tuple[tuple[float, float, float], ...]:
         return tuple(dict.fromkeys([(1.0, 0.0, 0.0), *super().linear_subspace]))
 
 
@@ -209,11 +214,11 @@ class Sliding(OnBeam):
     frame) or `body.at(...)`.
     """
 
-    def __init__(self, name: str, beam, child):
-        if not hasattr(beam, "elements"):
+    def __init__(self, name: str, beam: Beam, child: BodyOrFrame):
+        if not isinstance(beam, Beam):
             raise ValueError(f"joint {name!r}: beam is {beam!r}; give a lx.Beam, and any body as child")
         super().__init__(name, beam, child, beam, beam.elements - 1)
 
     @property
-    def kind(self):
+    def kind(self) -> JointKind:
         return JointKind("Sliding", WithinElement(self.strains), ("m",))

@@ -1,8 +1,11 @@
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from linkax.model.bodies import BodyOrFrame
 from linkax.model.joints.joint import AbstractJoint, unturned
-from linkax.model.numbers import positive
+from linkax.model.numbers import Number, positive
+from linkax.xla.arrays import Array, Scalar
 
 
 class Distance(AbstractJoint):
@@ -27,23 +30,25 @@ class Distance(AbstractJoint):
     combined_translations = (0, 1, 2)
     can_carry = False
 
-    length: Float[Array, ""]
+    length: Scalar
 
     rotation = staticmethod(unturned)
 
-    def __init__(self, name: str, parent, child, length):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, length: Number):
         super().__init__(name, parent, child, "x")
         remedy = "it must be positive; to join two points, use lx.Spherical"
         self.length = positive(length, f"distance {name!r}: length [m]", remedy)
 
     @property
-    def parameter(self):
+    def parameter(self) -> Scalar:
         return self.length
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[jax.Array, "0"]:
         return jnp.zeros(0, separation.dtype)
 
     @staticmethod
-    def combined(rotations, translations, parameter):
+    def combined(
+        rotations: Float[Array, " r"], translations: Float[Array, " t"], parameter: Scalar
+    ) -> Float[jax.Array, ""]:
         return (jnp.sum(translations * translations) / parameter - parameter) / 2.0

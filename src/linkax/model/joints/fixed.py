@@ -1,6 +1,10 @@
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
+from linkax.model.bodies import BodyOrFrame
 from linkax.model.joints.joint import AbstractJoint, unturned
+from linkax.xla.arrays import Array
 
 
 class Fixed(AbstractJoint):
@@ -15,9 +19,9 @@ class Fixed(AbstractJoint):
 
     rotation = staticmethod(unturned)
 
-    def __init__(self, name: str, parent, child, *, cut: bool = False):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False):
         super().__init__(name, parent, child, "x", cut=cut)
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[jax.Array, "0"]:
         return jnp.zeros(0, separation.dtype)

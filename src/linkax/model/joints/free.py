@@ -1,7 +1,11 @@
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
+from linkax.model.bodies import BodyOrFrame
 from linkax.model.joints.joint import AbstractJoint
 from linkax.spatial.quaternions import from_rotation_matrix, rotation_matrix
+from linkax.xla.arrays import Array
 
 
 class Free(AbstractJoint):
@@ -21,13 +25,13 @@ class Free(AbstractJoint):
     aligned_axes = ()
     locked_translations = ()
 
-    def __init__(self, name: str, parent, child, *, cut: bool = False):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False):
         super().__init__(name, parent, child, "x", cut=cut)
 
     @staticmethod
-    def rotation(coordinates):
+    def rotation(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
         return rotation_matrix(coordinates[:4])
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[jax.Array, "7"]:
         return jnp.concatenate([from_rotation_matrix(rotation), separation])

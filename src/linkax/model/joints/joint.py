@@ -2,16 +2,19 @@
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from linkax.model.bodies import Frame, frame_of
-from linkax.model.numbers import Constant, perpendicular_axes, require_bool, unit_axis, value
+from linkax.model.bodies import BodyOrFrame, Frame, frame_of
+from linkax.model.numbers import Axis, Constant, perpendicular_axes, require_bool, unit_axis, value
 from linkax.model.terms import Term
 from linkax.spatial.rotations import frame_about_axis, rotation_about_first_axis
+from linkax.xla.arrays import Array, Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +22,7 @@ class RelativeMotion(abc.ABC):
     """The motion of a joint in the tree, as a pure function that JAX differentiates."""
 
     @abc.abstractmethod
-    def __call__(self, coordinates: Float[Array, " n"], parameters: Float[Array, " k"]):
+    def __call__(self, coordinates: Float[Array, " n"], parameters: Float[Array, " k"]) -> Float[jax.Array, "4 4"]:
         """The child's frame seen from the parent's, in joint axes, (4, 4), see `linkax.spatial.screws`.
 
         Of joints with the same motion that have fewer coordinates than others, the last ones may be given as zero.
@@ -39,9 +42,12 @@ class JointKind:
 
     has_quaternion: ClassVar[bool] = False
     is_screw: ClassVar[bool] = False
+    # Never cut, so without rows.
+    combined_rotations: ClassVar[tuple[tuple[int, int], ...]] = ()
+    combined_translations: ClassVar[tuple[int, ...]] = ()
 
     @property
-    def __name__(self):
+    def __name__(self) -> str:
         return self.name
 
 
@@ -70,9 +76,9 @@ class AbstractJoint(eqx.Module):
     # The linear part is to be multiplied by `parameter`.
     is_screw: ClassVar[bool] = False
     # The angular part for joints whose axes turn with their own coordinates: (coordinates) -> (n, 3).
-    angular_subspace_at: ClassVar = None
+    angular_subspace_at: ClassVar[Callable[[Array], jax.Array] | None] = None
     # All of the motion, for joints that bend with other coordinates than their own; see `RelativeMotion`.
-    motion: ClassVar = None
+    motion: ClassVar[RelativeMotion | None] = None
     # Pairs (i, j), counted from 0, of axes that stay orthogonal: parent's hⁱ and child's hʲ.
     locked_rotations: ClassVar[tuple[tuple[int, int], ...]]
     # Axes, counted from 0, that point the same way on both; locked rotations alone allow a flip.
@@ -92,7 +98,16 @@ class AbstractJoint(eqx.Module):
     second_axis: Constant | Float[Array, "3"] | None
     cut: bool = eqx.field(static=True)
 
-    def __init__(self, name: str, parent, child, axis, *, second_axis=None, cut: bool = False):
+    def __init__(
+        self,
+        name: str,
+        parent: BodyOrFrame,
+        child: BodyOrFrame,
+        axis: Axis,
+        *,
+        second_axis: Axis | None = None,
+        cut: bool = False,
+    ):
         """**Arguments:**
 
         - `name`: unique in the mechanism.
@@ -111,7 +126,7 @@ class AbstractJoint(eqx.Module):
         if self.parent.body == self.child.body:
             raise ValueError(f"joint {name!r} connects body {self.parent.body!r} with itself; give two bodies")
         self.axis = unit_axis(axis, f"joint {name!r}: axis")
-        self.second_axis = second_axis
+        self.second_axis = None
         if second_axis is not None:
             what = f"joint {name!r}: second_axis"
             self.axis, self.second_axis = perpendicular_axes(self.axis, second_axis, what)
@@ -123,7 +138,7 @@ class AbstractJoint(eqx.Module):
         return len(self.speed_units) + self.has_quaternion
 
     @property
-    def kind(self):
+    def kind(self) -> "type[AbstractJoint] | JointKind":
         """What a topology keeps of this joint: its type, or what says the same of it."""
         return type(self)
 
@@ -138,16 +153,16 @@ class AbstractJoint(eqx.Module):
         return None
 
     @property
-    def length_estimate(self):
+    def length_estimate(self) -> Scalar | float:
         """About how far its `motion` takes the child from the parent [m]."""
         return 0.0
 
     @property
-    def parameter(self):
+    def parameter(self) -> Scalar | None:
         """The number of this joint that its type's rows or motion need (a length [m]), or None."""
         return None
 
-    def frames(self):
+    def frames(self) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """The joint's axes as columns, in the parent's and in the child's body axes."""
         second = None if self.second_axis is None else value(self.second_axis)
         axes = frame_about_axis(value(self.axis), second)
@@ -155,7 +170,7 @@ class AbstractJoint(eqx.Module):
 
     @staticmethod
     @abc.abstractmethod
-    def rotation(coordinates: Float[Array, " n"]) -> Float[Array, "3 3"]:
+    def rotation(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
         """Axes of the child's frame in those of the parent's, as columns."""
 
     @staticmethod
@@ -164,16 +179,18 @@ class AbstractJoint(eqx.Module):
         """Coordinates from the child's axes and origin, both in joint axes of the parent."""
 
     @staticmethod
-    def combined(rotations, translations, parameter) -> Float[Array, ""]:
+    def combined(
+        rotations: Float[Array, " r"], translations: Float[Array, " t"], parameter: Scalar | None
+    ) -> Float[jax.Array, ""]:
         """The row that combines others; `parameter` is the joint's own in units of ℓ."""
         raise NotImplementedError
 
 
-def hinged(coordinates) -> Float[Array, "3 3"]:
+def hinged(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
     """The `rotation` of a joint that turns about h¹ by its first coordinate."""
     return rotation_about_first_axis(coordinates[0])
 
 
-def unturned(coordinates) -> Float[Array, "3 3"]:
+def unturned(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
     """The `rotation` of a joint that does not turn."""
     return jnp.eye(3, dtype=coordinates.dtype)

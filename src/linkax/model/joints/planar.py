@@ -1,7 +1,10 @@
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from linkax.model.joints.joint import AbstractJoint, hinged
 from linkax.spatial.rotations import angle_about_first_axis
+from linkax.xla.arrays import Array
 
 
 class Planar(AbstractJoint):
@@ -24,5 +27,5 @@ class Planar(AbstractJoint):
     rotation = staticmethod(hinged)
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[jax.Array, "3"]:
         return jnp.stack([angle_about_first_axis(rotation), separation[1], separation[2]])

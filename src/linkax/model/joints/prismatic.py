@@ -1,4 +1,7 @@
+from jaxtyping import Float
+
 from linkax.model.joints.joint import AbstractJoint, unturned
+from linkax.xla.arrays import Array
 
 
 class Prismatic(AbstractJoint):
@@ -19,5 +22,5 @@ class Prismatic(AbstractJoint):
     rotation = staticmethod(unturned)
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[Array, "1"]:
         return separation[:1]

@@ -1,5 +1,9 @@
+import jax
+from jaxtyping import Float
+
 from linkax.model.joints.joint import AbstractJoint, hinged
 from linkax.spatial.rotations import angle_about_first_axis
+from linkax.xla.arrays import Array
 
 
 class Revolute(AbstractJoint):
@@ -21,5 +25,5 @@ class Revolute(AbstractJoint):
     rotation = staticmethod(hinged)
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[jax.Array, "1"]:
         return angle_about_first_axis(rotation)[None]

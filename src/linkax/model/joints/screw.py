@@ -1,10 +1,13 @@
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from linkax.model.bodies import BodyOrFrame
 from linkax.model.joints.joint import AbstractJoint, hinged
-from linkax.model.numbers import number, require
+from linkax.model.numbers import Axis, Number, number, require
 from linkax.spatial.rotations import angle_about_first_axis
+from linkax.xla.arrays import Array, Scalar
 
 
 class Screw(AbstractJoint):
@@ -28,25 +31,29 @@ class Screw(AbstractJoint):
     combined_rotations = ((1, 1), (2, 1))
     combined_translations = (0,)
 
-    pitch: Float[Array, ""]
+    pitch: Scalar
 
-    def __init__(self, name: str, parent, child, axis, pitch, *, cut: bool = False):
+    def __init__(
+        self, name: str, parent: BodyOrFrame, child: BodyOrFrame, axis: Axis, pitch: Number, *, cut: bool = False
+    ):
         super().__init__(name, parent, child, axis, cut=cut)
         what = f"joint {name!r}: pitch [m/rad]"
         self.pitch = require(number(pitch, (), what), lambda p: p != 0.0, what, "without advance, use lx.Revolute")
 
     @property
-    def parameter(self):
+    def parameter(self) -> Scalar:
         return self.pitch
 
     rotation = staticmethod(hinged)
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[jax.Array, "1"]:
         return angle_about_first_axis(rotation)[None]
 
     @staticmethod
-    def combined(rotations, translations, parameter):
+    def combined(
+        rotations: Float[Array, " r"], translations: Float[Array, " t"], parameter: Scalar
+    ) -> Float[jax.Array, ""]:
         angle = jnp.arctan2(rotations[1], rotations[0])
         turns = lax.stop_gradient(jnp.round((translations[0] / parameter - angle) / (2.0 * jnp.pi)))
         return translations[0] - parameter * (angle + 2.0 * jnp.pi * turns)

@@ -1,5 +1,10 @@
+import jax
+from jaxtyping import Float
+
+from linkax.model.bodies import BodyOrFrame
 from linkax.model.joints.joint import AbstractJoint
 from linkax.spatial.quaternions import from_rotation_matrix, rotation_matrix
+from linkax.xla.arrays import Array
 
 
 class Spherical(AbstractJoint):
@@ -18,11 +23,13 @@ class Spherical(AbstractJoint):
     aligned_axes = ()
     locked_translations = (0, 1, 2)
 
-    rotation = staticmethod(rotation_matrix)
-
-    def __init__(self, name: str, parent, child, *, cut: bool = False):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False):
         super().__init__(name, parent, child, "x", cut=cut)
 
     @staticmethod
-    def measure(rotation, separation):
+    def rotation(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
+        return rotation_matrix(coordinates)
+
+    @staticmethod
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[jax.Array, "4"]:
         return from_rotation_matrix(rotation)

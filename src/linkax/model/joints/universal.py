@@ -1,7 +1,10 @@
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from linkax.model.joints.joint import AbstractJoint
 from linkax.spatial.rotations import compose, rotation_about_first_axis
+from linkax.xla.arrays import Array
 
 
 class Universal(AbstractJoint):
@@ -21,19 +24,19 @@ class Universal(AbstractJoint):
     __init__ = AbstractJoint.__init__
 
     @staticmethod
-    def rotation(coordinates):
+    def rotation(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
         c, s = jnp.cos(coordinates[1]), jnp.sin(coordinates[1])
         zero, one = jnp.zeros_like(c), jnp.ones_like(c)
         about_second = jnp.stack([c, zero, s, zero, one, zero, -s, zero, c]).reshape(3, 3)
         return compose(rotation_about_first_axis(coordinates[0]), about_second)
 
     @staticmethod
-    def angular_subspace_at(coordinates):
+    def angular_subspace_at(coordinates: Float[Array, "2"]) -> Float[jax.Array, "2 3"]:
         c, s = jnp.cos(coordinates[0]), jnp.sin(coordinates[0])
         zero, one = jnp.zeros_like(c), jnp.ones_like(c)
         return jnp.stack([one, zero, zero, zero, c, s]).reshape(2, 3)
 
     @staticmethod
-    def measure(rotation, separation):
+    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[jax.Array, "2"]:
         first = jnp.arctan2(rotation[2, 1], rotation[1, 1])
         return jnp.stack([first, jnp.arctan2(rotation[0, 2], rotation[0, 0])])

@@ -1,0 +1,118 @@
+"""Take beams apart into rigid sections, the joints between them, and their elastic forces."""
+
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from linkax.model.beams import MASS_PLACES, Beam, BeamElasticity, Place
+from linkax.model.bodies import Frame, RigidBody
+from linkax.model.constraints import AbstractConstraint
+from linkax.model.forces import AbstractForce
+from linkax.model.joints.bending import BeamSegment, OnBeam, SleevePart, Sliding
+from linkax.model.joints.joint import AbstractJoint
+from linkax.model.numbers import rotation_matrix
+
+
+class Parts(NamedTuple):
+    """What a mechanism is made of, with beams taken apart."""
+
+    bodies: list[RigidBody]
+    joints: list[AbstractJoint]
+    forces: list[AbstractForce]
+    constraints: list[AbstractConstraint]
+
+
+def discretise_beams(
+    bodies: list[RigidBody | Beam],
+    joints: list[AbstractJoint],
+    forces: list[AbstractForce],
+    constraints: list[AbstractConstraint],
+) -> Parts:
+    """Replace each beam by sections, joints and forces, unless its sections are among the bodies already.
+
+    Places on it, and the parts of sleeves on it, become massless bodies.
+    """
+    names = {body.name for body in bodies}
+    beams = {body.name: body for body in bodies if isinstance(body, Beam) and body.nodes[0] not in names}
+    of_beams = [body for body in bodies if not isinstance(body, Beam) or body.name in beams]
+    sections = [part for body in of_beams for part in (_sections(body) if isinstance(body, Beam) else [body])]
+    if not beams:
+        return Parts(sections, joints, forces, constraints)
+    stations, holds = [], []
+
+    def on_station(part):
+        """The part itself, or a place on a beam as a frame on a massless body that is held there."""
+        if not (isinstance(part, Place) and part.body in beams):
+            return part
+        name = f"{part.body}({sum(body.name.startswith(part.body + '(') for body in stations) + 1})"
+        stations.append(RigidBody(name, 0.0))
+        holds.append(_hold(beams[part.body], name, part))
+        return Frame(name, jnp.asarray(part.offset) * np.array([0.0, 1.0, 1.0]), part.rotation)
+
+    elements = (joints, forces, constraints)
+    joints, forces, constraints = jax.tree.map(on_station, elements, is_leaf=lambda part: isinstance(part, Frame))
+    split = [_split_sleeve(joint, beams) for joint in joints]
+    segments = [segment for beam in beams.values() for segment in _segments(beam)]
+    return Parts(
+        [*sections, *stations, *(body for between, _ in split for body in between)],
+        [*segments, *holds, *(joint for _, parts in split for joint in parts)],
+        [*forces, *map(BeamElasticity, beams.values())],
+        constraints,
+    )
+
+
+def tree_joints_first(joints: Iterable[AbstractJoint]) -> list[set[str]]:
+    """Names of the joints that must be in the tree: those along beams, then those that slide on them too."""
+    joints = list(joints)
+    segments = {joint.name for joint in joints if isinstance(joint, BeamSegment)}
+    return [segments, {joint.name for joint in joints if isinstance(joint, OnBeam)}]
+
+
+def _sections(beam: Beam) -> list[RigidBody]:
+    """The sections of a beam: massless at nodes, with half of an element's mass at each place between them."""
+    density, (about_y, about_z) = beam.section.linear_density, beam.section.rotary_inertia
+    inertia, share = jnp.stack([about_y + about_z, about_y, about_z]), beam.element_length / len(MASS_PLACES)
+    at_nodes = {name: RigidBody(name, 0.0) for name in beam.nodes}
+    between = lambda name: RigidBody(name, share * density, inertia=share * inertia)
+    return [at_nodes[name] if name in at_nodes else between(name) for name in beam.sections]
+
+
+def _segments(beam: Beam) -> list[BeamSegment]:
+    """The joints from the first node of each element to its second one, and to the sections between them."""
+    joints = []
+    for element, far in enumerate(beam.nodes[1:]):
+        joints.append(_segment(beam, beam.name if element == 0 else far, far, element, 1.0))
+        for place in MASS_PLACES:
+            name = beam.section_name(element + place)
+            joints.append(_segment(beam, name, name, element, float(place)))
+    return joints
+
+
+def _hold(beam: Beam, name: str, place: Place) -> BeamSegment:
+    """The joint that holds a massless body at a place on the axis."""
+    within = place.offset[0] / beam.element_length - place.element
+    return _segment(beam, name, name, place.element, within)
+
+
+def _segment(beam, name, child, element, place):
+    return BeamSegment(name, _reference(beam.nodes[element]), _reference(child), beam, element, place)
+
+
+def _split_sleeve(sleeve: AbstractJoint, beams: dict[str, Beam]) -> tuple[list[RigidBody], list[AbstractJoint]]:
+    """The parts of a sleeve, one in each element, after the massless bodies between them; other joints as they are."""
+    if not (isinstance(sleeve, Sliding) and sleeve.beam in beams):
+        return [], [sleeve]
+    beam = beams[sleeve.beam]
+    between = [RigidBody(f"{sleeve.name}[{element + 1}]", 0.0) for element in range(beam.elements - 1)]
+    ends = [sleeve.parent, *(body.reference for body in between), sleeve.child]
+    names = [*(body.name for body in between), sleeve.name]
+    parts = zip(names, pairwise(ends), strict=True)
+    return between, [SleevePart(name, *pair, beam, element, sleeve.name) for element, (name, pair) in enumerate(parts)]
+
+
+def _reference(body: str) -> Frame:
+    return Frame(body, np.zeros(3), rotation_matrix(None, body))

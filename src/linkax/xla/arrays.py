@@ -1,0 +1,10 @@
+"""Types of arrays, for annotations."""
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+# JAX's arrays, or NumPy's where the values are known when a model is built.
+Array = jax.Array | np.ndarray
+# Arithmetic of NumPy's arrays without dimensions gives its scalars.
+Scalar = Float[Array | np.floating, ""]
