@@ -7,7 +7,7 @@ need products along the way. Featherstone, Rigid Body Dynamics Algorithms (2008)
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.coordinates import coordinates_by_speed
 from linkax.equations.joint_motions import joint_motions
@@ -23,6 +23,7 @@ from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import jit_inline
 
 
@@ -47,9 +48,9 @@ class Configuration(eqx.Module):
     system: System
     t: Float[Array, ""]
     q: Float[Array, " n_q"]
-    rotation: Float[Array, "n_b+1 3 3"]
+    rotation: Float[Array, "n_frames 3 3"]
     link: Float[Array, "n_b 3"]
-    position: Float[Array, "n_b+1 3"]
+    position: Float[Array, "n_frames 3"]
     joint_axes: Float[Array, "n_j 3 3"]
     parent_arm: Float[Array, "n_j 3"]
     child_arm: Float[Array, "n_j 3"]

@@ -6,11 +6,12 @@ angular velocity is in axes of the parent.
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.model.topology import Topology
 from linkax.spatial.quaternions import conjugate, from_rotation_vector, multiply, normalised, rotation_matrix
 from linkax.spatial.rotations import rotate
+from linkax.xla.arrays import Array
 from linkax.xla.static_scatter import scatter_static
 
 

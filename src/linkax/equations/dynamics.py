@@ -8,7 +8,7 @@ from functools import reduce
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, along_speeds
 from linkax.equations.motion import Motion
@@ -17,6 +17,7 @@ from linkax.linalg.static_sparse import StaticSparse, constant_product, products
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
+from linkax.xla.arrays import Array
 
 
 def world_inertia(configuration: Configuration) -> Float[Array, "n_b 3 3"]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration
 from linkax.equations.loop_rows import chosen_rows, row_jacobian, row_residual
@@ -13,6 +13,7 @@ from linkax.equations.loops import residual
 from linkax.equations.system import System
 from linkax.spatial.rotations import rotate, transpose
 from linkax.spatial.vectors import cross
+from linkax.xla.arrays import Array
 
 FLIP_WEIGHT = 2.0  # more than one: axes that point apart are farther from being in line than those at a right angle
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, bodies_of_cuts
 from linkax.equations.motion import Motion
@@ -19,6 +19,7 @@ from linkax.equations.tree_sums import sum_by_speed
 from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs
 from linkax.spatial.rotations import transpose
 from linkax.spatial.vectors import cross, dot
+from linkax.xla.arrays import Array
 
 
 class RowVectors(NamedTuple):

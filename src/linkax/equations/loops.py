@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, along_speeds
 from linkax.equations.coordinates import coordinates_by_speed
@@ -29,6 +29,7 @@ from linkax.equations.motion import Motion
 from linkax.equations.system import System
 from linkax.linalg.static_sparse import StaticSparse
 from linkax.model.ropes import Rope
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import jit_inline
 
 

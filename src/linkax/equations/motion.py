@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration
 from linkax.equations.joint_motions import over_bending
@@ -18,6 +18,7 @@ from linkax.model.terms import Term
 from linkax.spatial.rotations import rotate
 from linkax.spatial.screws import turn_rate
 from linkax.spatial.vectors import cross
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import whole_jacobian
 from linkax.xla.static_scatter import scatter_static
 from linkax.xla.tracing import jit_inline
@@ -34,10 +35,10 @@ class Motion(eqx.Module):
 
     configuration: Configuration
     v: Float[Array, " n_v"]
-    angular_velocity: Float[Array, "n_b+1 3"]
-    velocity: Float[Array, "n_b+1 3"]
-    angular_bias: Float[Array, "n_b+1 3"]
-    bias: Float[Array, "n_b+1 3"]
+    angular_velocity: Float[Array, "n_frames 3"]
+    velocity: Float[Array, "n_frames 3"]
+    angular_bias: Float[Array, "n_frames 3"]
+    bias: Float[Array, "n_frames 3"]
     edge_turn: Float[Array, "n_b 3"]
     edge_rate: Float[Array, "n_b 3"]
     edge_angular_bias: Float[Array, "n_b 3"]

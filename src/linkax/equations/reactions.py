@@ -4,7 +4,7 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, bodies_of_cuts
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
@@ -15,6 +15,7 @@ from linkax.equations.tree_sums import expand_to_motions, over_subtree, sum_by_b
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross
+from linkax.xla.arrays import Array
 
 Side = Literal["child", "parent"]
 Axes = Literal["ground", "joint"]

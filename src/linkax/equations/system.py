@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.structure import Structure, structure_of
 from linkax.model.constraints import AbstractConstraint, LinearConstraint
@@ -13,6 +13,7 @@ from linkax.model.joints.joint import RelativeMotion
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import length as length_of
+from linkax.xla.arrays import Array
 
 
 class System(eqx.Module):

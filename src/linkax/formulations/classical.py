@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.coordinates import on_manifold, retract
 from linkax.equations.dynamics import generalised_force
@@ -16,6 +16,7 @@ from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Dynamics, LinearSystem, linear_system
 from linkax.model.numbers import whole_number, zero_or_more
+from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
 from linkax.xla.tracing import jit_inline
 

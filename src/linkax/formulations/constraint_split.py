@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from linkax.equations.configuration import Configuration, configure
 from linkax.equations.loops import drive_acceleration, jacobian, velocity_gamma
@@ -18,6 +18,7 @@ from linkax.equations.system import System
 from linkax.linalg.constrained_solve import SaddleInverse, constrained_solve, invert_apart
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.spatial.vectors import length
+from linkax.xla.arrays import Array
 
 OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
 

@@ -4,13 +4,14 @@ import abc
 from typing import NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, configure
 from linkax.equations.dynamics import mass_entries
 from linkax.equations.loops import jacobian_entries
 from linkax.equations.system import System
 from linkax.linalg.block_elimination import Blocks, in_fronts
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import jit_inline
 
 

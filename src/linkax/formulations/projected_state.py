@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import on_manifold, retract
@@ -27,6 +27,7 @@ from linkax.linalg.constrained_solve import SaddleInverse
 from linkax.linalg.least_multipliers import least_multipliers
 from linkax.linalg.while_falling import while_falling
 from linkax.spatial.vectors import largest
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import jit_inline
 

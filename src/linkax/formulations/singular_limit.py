@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.primitives import bounded_while_loop
 

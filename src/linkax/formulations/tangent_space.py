@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import Configuration
 from linkax.equations.coordinates import on_manifold, retract
@@ -35,6 +35,7 @@ from linkax.linalg.constrained_solve import (
 )
 from linkax.model.numbers import number, one_of, require, whole_number
 from linkax.spatial.vectors import largest
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import jit_inline
 
 Metric = Literal["mass", "identity"]
@@ -73,7 +74,7 @@ class TangentSpace(AbstractFormulation):
     **Raises:** `ValueError` for a rank tolerance that is not a positive number of at most 1.
     """
 
-    rank_tolerance: Float[Array | np.ndarray, ""] | None
+    rank_tolerance: Float[Array, ""] | None
     rank_nearby: Int[Array, " k"] | None
     metric: Metric = eqx.field(static=True)
     corrections: int = eqx.field(static=True)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, configure
 from linkax.equations.coordinates import rates, speeds
@@ -17,6 +17,7 @@ from linkax.equations.dynamics import unbalanced_force
 from linkax.equations.loops import gamma, jacobian, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise, pushforward
 
 

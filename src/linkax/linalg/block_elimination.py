@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from linkax.linalg.constrained_solve import independent
 from linkax.linalg.elimination_plan import EliminationPlan
@@ -22,6 +22,7 @@ from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.static_sparse import StaticSparse, constant_product
 from linkax.linalg.triangular import cholesky_inverse, upper_inverse
 from linkax.spatial.vectors import length
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 
 
@@ -32,7 +33,7 @@ class Blocks(NamedTuple):
       p, p).
     """
 
-    rows: Float[Array, "k m s+p"]
+    rows: Float[Array, "k m width"]
     coupling: Float[Array, "k s p"]
     own: Float[Array, "k p p"]
 
@@ -51,8 +52,8 @@ class BlockInverse(eqx.Module):
 
     plan: EliminationPlan = eqx.field(static=True)
     scales: Float[Array, " n"]
-    forwards: Float[Array, "k 2s 2s+p+m"]
-    backwards: Float[Array, "k 2s+p+m 4s+p+m"]
+    forwards: Float[Array, "k passed known"]
+    backwards: Float[Array, "k found inputs"]
     last: Float[Array, "s s"]
     rank: Int[Array, " k"]
     distance: Float[Array, ""]
@@ -155,8 +156,8 @@ class _Passed(NamedTuple):
 
 
 class _Eliminated(NamedTuple):
-    forwards: Float[Array, "2s 2s+p+m"]
-    backwards: Float[Array, "2s+p+m 4s+p+m"]
+    forwards: Float[Array, "passed known"]
+    backwards: Float[Array, "found inputs"]
     rank: Int[Array, ""]
     distance: Float[Array, ""]
     definiteness: Float[Array, ""]

@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.static_sparse import assembled
 from linkax.linalg.triangular import cholesky_inverse, cholesky_inverse_by_elimination, upper_inverse
 from linkax.spatial.vectors import length
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import jit_inline
 

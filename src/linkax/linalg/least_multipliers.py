@@ -3,9 +3,10 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.xla.arrays import Array
 
 
 class LeastMultipliers(NamedTuple):

@@ -12,7 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
+
+from linkax.xla.arrays import Array
 
 # A CPU factorises so many matrices together, if they have so many entries; fewer are faster each by itself, and many
 # more do not fit into its cache.

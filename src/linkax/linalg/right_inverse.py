@@ -5,9 +5,10 @@ A row counts as dependent, or a singular value as zero, below a fixed cut-off, a
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.linalg.row_echelon import row_echelon
+from linkax.xla.arrays import Array
 
 ROUNDING_ULPS = 10.0
 

@@ -4,7 +4,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
+
+from linkax.xla.arrays import Array
 
 
 class RowEchelon(NamedTuple):

@@ -1,7 +1,9 @@
 """The largest magnitude of a matrix's eigenvalues, by products alone: for batches, and on any device."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from linkax.xla.arrays import Array
 
 SQUARINGS = 10
 

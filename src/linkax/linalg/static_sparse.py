@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from linkax.xla.arrays import Array
 
 SPARSE = 0.25  # of the entries: what is read is slower than what is in order
 LARGE = 256  # entries of a full matrix that are not worth it

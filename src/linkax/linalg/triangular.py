@@ -6,8 +6,9 @@ A batch of small matrices would spend its time in calling LAPACK. Larger ones go
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from linkax.xla.arrays import Array
 from linkax.xla.batches import small_in_batches
 
 

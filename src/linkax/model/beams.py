@@ -198,7 +198,7 @@ class Beam(AbstractBody):
         places = np.add.outer(np.arange(self.elements), [0.0, *MASS_PLACES]).reshape(-1)
         return tuple(self.section_name(place) for place in (*places, self.elements))
 
-    def section_name(self, place: float) -> str:
+    def section_name(self, place: float | int) -> str:
         """The name of the section at a place, counted in elements from the base."""
         return f"{self.name}[{np.round(place, 2):g}]"
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from linkax.model.forces import AbstractForce
 from linkax.model.joints.bending import BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import rotation_matrix
+from linkax.xla.arrays import Scalar
 
 
 class Parts(NamedTuple):
@@ -44,7 +45,7 @@ def discretise_beams(
         return Parts(sections, joints, forces, constraints)
     stations, holds = [], []
 
-    def on_station(part):
+    def on_station(part: Any) -> Any:
         """The part itself, or a place on a beam as a frame on a massless body that is held there."""
         if not (isinstance(part, Place) and part.body in beams):
             return part
@@ -98,7 +99,7 @@ def _hold(beam: Beam, name: str, place: Place) -> BeamSegment:
     return _segment(beam, name, name, place.element, within)
 
 
-def _segment(beam, name, child, element, place):
+def _segment(beam: Beam, name: str, child: str, element: int, place: Scalar | float) -> BeamSegment:
     return BeamSegment(name, _reference(beam.nodes[element]), _reference(child), beam, element, place)
 
 

@@ -86,5 +86,5 @@ def held_unless(law: Law, t: Number, moves: Any) -> Callable[..., Any]:
     return jax.tree_util.Partial(_held_unless, law, t, moves)
 
 
-def _held_unless(law, start, moves, t):
+def _held_unless(law: Law, start: Number, moves: Any, t: Number) -> jax.Array:
     return law(start) + jnp.where(moves, law(t) - law(start), 0.0)

@@ -81,13 +81,13 @@ def _mobile(cut: AbstractJoint, loop: list[AbstractJoint], orientation: Orientat
         return EVERY_ROW
     parent_axes, child_axes = parents[0] @ cut.frames()[0], child @ cut.frames()[1]
 
-    def fixed(direction):
-        return not turns or np.linalg.norm(np.cross(turns[0], direction)) <= PARALLEL
+    def fixed(direction: np.ndarray) -> bool:
+        return not turns or bool(np.linalg.norm(np.cross(turns[0], direction)) <= PARALLEL)
 
-    def rotates(i, j):
+    def rotates(i: int, j: int) -> bool:
         return not fixed(parent_axes[:, i]) and not fixed(child_axes[:, j])
 
-    def translates(i):
+    def translates(i: int) -> bool:
         across = all(abs(slide @ parent_axes[:, i]) <= PARALLEL for slide in slides)
         return not (fixed(parent_axes[:, i]) and across)
 

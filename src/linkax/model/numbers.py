@@ -68,7 +68,7 @@ def number(entry: Any, shape: tuple[int, ...], what: str) -> Float[Array, "..."]
     return require(array, is_finite, what, "it must be finite")
 
 
-def is_finite(array: Array) -> Any:
+def is_finite(array: Array | np.floating) -> Any:
     """Whether all numbers of an array are."""
     known = concrete(array)
     return jnp.isfinite(array).all() if known is None else np.isfinite(known).all()

@@ -1,6 +1,6 @@
 """Ropes over points of bodies: of a given length, or elastic."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -20,7 +20,7 @@ from linkax.xla.arrays import Array, Scalar
 Points = tuple[Frame, ...]
 
 
-def _points(points: Sequence[BodyOrFrame], what: str) -> Points:
+def _points(points: Iterable[BodyOrFrame], what: str) -> Points:
     remedy = "give a list of bodies, body.at(...), or lx.GROUND.at(...)"
     given = listed(points, (AbstractBody, Frame), f"{what}: points", remedy)
     frames = tuple(frame_of(point, f"{what}: a point") for point in given)
@@ -47,7 +47,7 @@ def _rate(motion: Motion, points: Points) -> Float[Array, "n 3"]:
     return velocity[1:] - velocity[:-1]
 
 
-def _pull(configuration: Configuration, points: Points, tension: Scalar) -> Load:
+def _pull(configuration: Configuration, points: Points, tension: Number) -> Load:
     """What a rope does to its points."""
     forces = tension * _directions(_spans(configuration, points))
     total = Load.none(configuration.system)
@@ -76,7 +76,7 @@ class Rope(AbstractConstraint):
     points: Points
     length: Scalar | Law
 
-    def __init__(self, name: str, points: Sequence[BodyOrFrame], length: Number | Callable[[Any], Number]):
+    def __init__(self, name: str, points: Iterable[BodyOrFrame], length: Number | Callable[[Any], Number]):
         self.name = checked_name(name, "rope")
         self.points = _points(points, f"rope {name!r}")
         if callable(length):
@@ -106,7 +106,7 @@ class Rope(AbstractConstraint):
         """Minus its length: rows are such that their multipliers are tensions."""
         return -jnp.sum(length(_spans(configuration, self.points)))
 
-    def load(self, configuration: Configuration, tension: Scalar) -> Load:
+    def load(self, configuration: Configuration, tension: Number) -> Load:
         """What it does to its points."""
         return _pull(configuration, self.points, tension)
 
@@ -133,7 +133,7 @@ class ElasticRope(AbstractForce):
     free_length: Scalar
     damping: Scalar
 
-    def __init__(self, points: Sequence[BodyOrFrame], stiffness: Number, free_length: Number, damping: Number = 0.0):
+    def __init__(self, points: Iterable[BodyOrFrame], stiffness: Number, free_length: Number, damping: Number = 0.0):
         self.points = _points(points, "ElasticRope")
         self.stiffness = positive(stiffness, f"{self.display_name}: stiffness [N/m]")
         self.free_length = positive(free_length, f"{self.display_name}: free_length [m]")

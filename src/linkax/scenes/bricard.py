@@ -4,14 +4,14 @@ Five rods and six hinges: counted, it cannot move; it does, as one of its loop r
 """
 
 import linkax as lx
-from linkax.scenes.scene import Scene, Variant
+from linkax.scenes.scene import Parameters, Scene, Variant
 
 # Where the hinges are at the start, in lengths of a rod, and about which axis each turns.
 PLACES = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.0, -1.0, 1.0), (0.0, -1.0, 1.0), (0.0, 0.0, 1.0))
 AXES = "yzxyzx"
 
 
-def _rod(index, parameters):
+def _rod(index: int, parameters: Parameters) -> lx.RigidBody:
     """A square bar from one hinge to the next, in world axes at the start."""
     along = [end - begin for begin, end in zip(PLACES[index], PLACES[index + 1], strict=True)]
     length, width, mass = parameters["length"], parameters["width"], parameters["mass"]
@@ -25,7 +25,7 @@ def _rod(index, parameters):
     )
 
 
-def _mechanism(parameters):
+def _mechanism(parameters: Parameters) -> lx.Mechanism:
     rods = [_rod(index, parameters) for index in range(5)]
     far = lx.GROUND.at([parameters["length"] * part for part in PLACES[-1]])
     ends = [lx.GROUND, *(rod.at("tip") for rod in rods)], [*(rod.at("base") for rod in rods), far]
@@ -36,7 +36,7 @@ def _mechanism(parameters):
     return lx.Mechanism(rods, joints, [lx.Gravity([0.0, -parameters["gravity"], 0.0])])
 
 
-def _initial(mechanism, parameters):
+def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     return lx.assemble(mechanism, {"P1": parameters["angle"]}, {"P1": parameters["speed"]})
 
 

@@ -8,10 +8,12 @@ import math
 import jax.numpy as jnp
 
 import linkax as lx
-from linkax.scenes.scene import Scene, Variant
+from linkax.model.numbers import Number
+from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.xla.arrays import Scalar
 
 
-def _mechanism(parameters):
+def _mechanism(parameters: Parameters) -> lx.Mechanism:
     crank = lx.rod("crank", length=parameters["crank"], mass=parameters["crank_mass"])
     rod = lx.rod("rod", length=parameters["rod"], mass=parameters["rod_mass"])
     slider = lx.point_mass("slider", mass=parameters["slider_mass"])
@@ -27,7 +29,7 @@ def _mechanism(parameters):
     )
 
 
-def _initial(mechanism, parameters):
+def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     crank, angle, speed = parameters["crank"], parameters["angle"], parameters["speed"]
     inclination, rate, distance = _rod(crank, parameters["rod"], angle, speed)
     return lx.assemble(
@@ -39,7 +41,7 @@ def _initial(mechanism, parameters):
     )
 
 
-def _rod(crank, rod, angle, speed):
+def _rod(crank: Number, rod: Number, angle: Number, speed: Number) -> tuple[Scalar, Scalar, Scalar]:
     """Angle of the rod from +x [rad], its rate [rad/s], and the slider's distance [m].
 
     Where the crank is not shorter than the rod, the rod points to +x while the crank does: with

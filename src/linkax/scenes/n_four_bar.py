@@ -5,12 +5,15 @@ When all links lie in line the mechanism has N + 1 degrees of freedom for a mome
 
 import math
 
+import numpy as np
+
 import linkax as lx
+from linkax.model.numbers import Number
 from linkax.scenes.closed_form import turned_link
-from linkax.scenes.scene import Scene, Variant
+from linkax.scenes.scene import Parameters, Scene, Variant
 
 
-def _mechanism(parameters):
+def _mechanism(parameters: Parameters) -> lx.Mechanism:
     count, length, mass = parameters["N"], parameters["length"], parameters["mass"]
     links = [lx.rod(f"link_{i}", length, mass) for i in range(count + 1)]
     couplers = [lx.rod(f"coupler_{i}", length, mass) for i in range(1, count + 1)]
@@ -26,7 +29,7 @@ def _mechanism(parameters):
     return lx.Mechanism([*links, *couplers], joints, [lx.Gravity([0.0, -parameters["gravity"], 0.0])])
 
 
-def _initial(mechanism, parameters):
+def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     """All joints are given, because a start with the links in line has other branches too."""
     return lx.assemble(
         mechanism,
@@ -35,7 +38,7 @@ def _initial(mechanism, parameters):
     )
 
 
-def _parallel(count, turn):
+def _parallel(count: int, turn: Number) -> dict[str, Number]:
     """All joints where vertical links turn alike and couplers only translate."""
     return (
         {f"pivot_{i}": turn for i in range(count + 1)}
@@ -44,7 +47,7 @@ def _parallel(count, turn):
     )
 
 
-def _exact(parameters, times):
+def _exact(parameters: Parameters, times: np.ndarray) -> dict[str, np.ndarray] | None:
     """Couplers only translate, so that the row moves like a pendulum of N + 1 links and N masses at their ends."""
     count, length = parameters["N"], parameters["length"]
     weight, inertia = (count + 1) / 2 + count, (count + 1) / 3 + count

@@ -1,11 +1,13 @@
 """Planar simple pendulum, problem A01 of the LIM/IFToMM benchmark library."""
 
+import numpy as np
+
 import linkax as lx
 from linkax.scenes.closed_form import turned_link
-from linkax.scenes.scene import Scene, Variant
+from linkax.scenes.scene import Parameters, Scene, Variant
 
 
-def _mechanism(parameters):
+def _mechanism(parameters: Parameters) -> lx.Mechanism:
     at_tip = [parameters["length"], 0.0, 0.0]
     link = lx.RigidBody("link", parameters["mass"], center_of_mass=at_tip, frames={"bob": at_tip})
     return lx.Mechanism(
@@ -15,11 +17,11 @@ def _mechanism(parameters):
     )
 
 
-def _initial(mechanism, parameters):
+def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     return lx.assemble(mechanism, {"pivot": parameters["angle"]}, {"pivot": parameters["speed"]})
 
 
-def _exact(parameters, times):
+def _exact(parameters: Parameters, times: np.ndarray) -> dict[str, np.ndarray] | None:
     length = parameters["length"]
     link = turned_link(times, parameters["gravity"] / length, parameters["angle"], parameters["speed"])
     return None if link is None else {"bob": length * link}

@@ -6,11 +6,12 @@ J. Moore, Learn Multibody Dynamics, chapter on holonomic constraints. One link h
 import math
 
 import linkax as lx
-from linkax.scenes.scene import Scene, Variant
+from linkax.model.numbers import Number
+from linkax.scenes.scene import Parameters, Scene, Variant
 
 
-def _mechanism(parameters):
-    def massless(name, length, particle):
+def _mechanism(parameters: Parameters) -> lx.Mechanism:
+    def massless(name: str, length: Number, particle: Number) -> lx.RigidBody:
         """A massless link with a particle at its tip."""
         tip = [length, 0.0, 0.0]
         return lx.RigidBody(name, particle, center_of_mass=tip, frames={"base": [0.0, 0.0, 0.0], "tip": tip})
@@ -30,7 +31,7 @@ def _mechanism(parameters):
     )
 
 
-def _initial(mechanism, parameters):
+def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     guess = {"P2": math.radians(6.6), "P3": math.radians(-151.4)}
     return lx.assemble(mechanism, {"P1": parameters["angle"]}, {"P1": parameters["speed"]}, guess=guess)
 

@@ -9,7 +9,9 @@ import math
 import jax.numpy as jnp
 
 import linkax as lx
-from linkax.scenes.scene import Scene, Variant
+from linkax.model.numbers import Number
+from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.xla.arrays import Scalar
 
 SECTION = 10.0  # length of each section [m]
 OVERLAP = 1.0  # how far each section's rear end is ahead of the last one's, retracted [m]
@@ -17,17 +19,17 @@ FOOT = (2.0, -1.0)  # of the luffing cylinder, from the boom's pivot [m]
 HEAD = 4.0  # of the luffing cylinder, along the boom [m]
 
 
-def _section(index, mass):
+def _section(index: int, mass: Number) -> lx.RigidBody:
     return lx.rod(f"section_{index}", SECTION, mass)
 
 
-def _cylinder(name, mass, center, inertia):
+def _cylinder(name: str, mass: Number, center: float, inertia: float) -> lx.RigidBody:
     """A part of the luffing cylinder, along x; mass [kg], centre of mass halfway [m], inertia [kg m²]."""
     frames = {"end": [2.0 * center, 0.0, 0.0]}
     return lx.RigidBody(name, mass, [center, 0.0, 0.0], [0.0, inertia, inertia], frames)
 
 
-def _mechanism(parameters):
+def _mechanism(parameters: Parameters) -> lx.Mechanism:
     sections = [_section(index, parameters[f"mass_{index}"]) for index in (1, 2, 3)]
     barrel = _cylinder("barrel", 150.0, 1.2, 80.0)
     piston = _cylinder("piston", 100.0, -1.0, 40.0)
@@ -56,12 +58,12 @@ def _mechanism(parameters):
     )
 
 
-def _reach(angle):
+def _reach(angle: Number) -> Scalar:
     """Length of the luffing cylinder at an angle of the boom [m]."""
     return jnp.hypot(HEAD * jnp.cos(angle) - FOOT[0], HEAD * jnp.sin(angle) - FOOT[1])
 
 
-def _initial(mechanism, parameters):
+def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     angle, slide = parameters["angle"], OVERLAP + parameters["extension"]
     inclination = jnp.arctan2(HEAD * jnp.sin(angle) - FOOT[1], HEAD * jnp.cos(angle) - FOOT[0])
     guess = {"slide_3": slide, "foot": inclination, "luffing": _reach(angle), "head": inclination - angle}

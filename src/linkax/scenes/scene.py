@@ -25,7 +25,7 @@ class Variant:
     """
 
     summary: str
-    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    parameters: Mapping[str, float | int] = dataclasses.field(default_factory=dict)
     t1: float | None = None
 
 
@@ -53,7 +53,7 @@ class Scene:
 
     name: str
     summary: str
-    parameters: Mapping[str, float]
+    parameters: Mapping[str, float | int]
     meanings: Mapping[str, str]
     variants: Mapping[str, Variant]
     default_variant: str

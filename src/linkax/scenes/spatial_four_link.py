@@ -11,10 +11,10 @@ import numpy as np
 
 import linkax as lx
 from linkax.scenes.closed_form import turned_link
-from linkax.scenes.scene import Scene, Variant
+from linkax.scenes.scene import Parameters, Scene, Variant
 
 
-def _mechanism(parameters):
+def _mechanism(parameters: Parameters) -> lx.Mechanism:
     length, mass = parameters["length"], parameters["mass"]
     crank, coupler, rocker = (lx.rod(name, length, mass) for name in ("crank", "coupler", "rocker"))
     return lx.Mechanism(
@@ -29,13 +29,13 @@ def _mechanism(parameters):
     )
 
 
-def _initial(mechanism, parameters):
+def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     """All joints are given, because a start with the links in line has other branches too."""
     turning = lambda turn: {"A": turn, "B": -turn, "C": turn, "D": turn}
     return lx.assemble(mechanism, turning(parameters["angle"]), turning(parameters["speed"]))
 
 
-def _exact(parameters, times):
+def _exact(parameters: Parameters, times: np.ndarray) -> dict[str, np.ndarray] | None:
     """The coupler only translates, so that the rhombus moves like a pendulum: 5/3 m l² α̈ = −2 m g l cos α."""
     length = parameters["length"]
     stiffness = 1.2 * parameters["gravity"] / length

@@ -9,13 +9,15 @@ Sizes are about those of a mobile crane for 30 tonnes; they are from no data she
 """
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
 
 import linkax as lx
+from linkax.model.bodies import BodyOrFrame
 from linkax.model.numbers import Number
-from linkax.scenes.scene import Scene, Variant
+from linkax.scenes.scene import Parameters, Scene, Variant
 from linkax.xla.arrays import Scalar
 
 SECTION = 10.0  # length of each section [m]
@@ -52,12 +54,12 @@ def reach(angle: Number) -> Scalar:
     return jnp.hypot(HEAD * jnp.cos(angle) - FOOT[0], HEAD * jnp.sin(angle) - FOOT[1])
 
 
-def _course(parameters, name):
+def _course(parameters: Parameters, name: str) -> Course:
     begin, end = parameters[name], parameters[f"{name}_change"]
     return Course(*map(jnp.asarray, (begin, begin + end, parameters["duration"])))
 
 
-def _boom(parameters):
+def _boom(parameters: Parameters) -> list[lx.Beam]:
     steel = lx.Material(parameters["modulus"], **STEEL)
     planar = parameters["planes"] == 1
     profile = lambda index: lx.rectangle(
@@ -78,7 +80,9 @@ def _boom(parameters):
     ]
 
 
-def _telescope(outer, inner, index, pad):
+def _telescope(
+    outer: lx.Beam, inner: lx.Beam, index: int, pad: Callable[..., lx.AbstractJoint]
+) -> tuple[list[lx.RigidBody], list[lx.AbstractJoint]]:
     """The pads between two sections: massless shoes that slide on one, and joints from these to the other."""
     rear, front = (lx.point_mass(f"{end}_shoe_{index}", 0.0) for end in ("rear", "front"))
     return [rear, front], [
@@ -89,11 +93,13 @@ def _telescope(outer, inner, index, pad):
     ]
 
 
-def _mechanism(parameters):
+def _mechanism(parameters: Parameters) -> lx.Mechanism:
     boom = first, second, third = _boom(parameters)
     planar = parameters["planes"] == 1
 
-    def hinge(name, parent, child, cut=False, second_axis="y"):
+    def hinge(
+        name: str, parent: BodyOrFrame, child: BodyOrFrame, cut: bool = False, second_axis: str = "y"
+    ) -> lx.AbstractJoint:
         if planar:
             return lx.Revolute(name, parent, child, axis="z", cut=cut)
         return lx.Universal(name, parent, child, axis="z", second_axis=second_axis, cut=cut)
@@ -127,9 +133,9 @@ def _mechanism(parameters):
     )
 
 
-def _initial(mechanism, parameters):
+def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     """At rest, bent by the load that hangs on it before."""
-    before = _mechanism(parameters | {"payload": parameters["payload"] + parameters["dropped"]})
+    before = _mechanism({**parameters, "payload": parameters["payload"] + parameters["dropped"]})
     extension, angle = parameters["extension"], parameters["angle"]
     guess = {"slew": parameters["slew"], "pivot": angle, "hook": -angle}
     for index in (2, 3):

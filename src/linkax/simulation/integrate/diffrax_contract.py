@@ -13,7 +13,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from linkax.xla.arrays import Array
 
 
 class StepError(NamedTuple):

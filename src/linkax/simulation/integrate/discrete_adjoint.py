@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.simulation.integrate import diffrax_contract
 from linkax.simulation.integrate.problem import derivative
@@ -21,6 +21,7 @@ from linkax.simulation.integrate.step_derivatives import (
     cotangents_over_steps,
     tangents_over_steps,
 )
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise
 from linkax.xla.primitives import primitive
 

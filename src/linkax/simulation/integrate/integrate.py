@@ -1,5 +1,6 @@
 """The compiled programs of a run: check its start, integrate, close what was saved."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
@@ -7,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
 
 from linkax.equations.system import system_of
 from linkax.simulation.integrate.discrete_adjoint import Found, Integrator, integrate, solve_by_diffrax
@@ -22,6 +23,7 @@ from linkax.simulation.integrate.switches import start_sides
 from linkax.simulation.start.initial_state import InitialCheck, check_initial_state
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import Program, concrete, quick_compile
 from linkax.xla.undefined import undefined_where
 
@@ -103,7 +105,7 @@ def _in_order(t0, t1, dt0, saveat):
 class _OnManifold(eqx.Module):
     """A user's function of (t, state, mechanism), for diffrax: the state is closed first."""
 
-    function: callable
+    function: Callable
 
     def __call__(self, t, y, args, **unused):  # diffrax passes `args` by name where it seeks the root of an event
         return self.function(t, args.close(t, y), args.mechanism)

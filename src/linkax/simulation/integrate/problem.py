@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from linkax.equations.coordinates import rates, speeds
 from linkax.equations.system import System
@@ -16,6 +16,7 @@ from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack
 from linkax.simulation.integrate.switches import held, values
 from linkax.simulation.start.state import State
+from linkax.xla.arrays import Array
 from linkax.xla.one_kernel import where_finite
 
 

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.simulation.integrate.diffrax_contract import SolverState, StepError, stage_distances
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.integrate.switches import crossed, meet
+from linkax.xla.arrays import Array
 from linkax.xla.one_kernel import in_one_kernel
 
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
@@ -147,7 +148,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         sound=lambda self, terms, t0, t1, y0, *_: jnp.all(jnp.isfinite(y0)),
     )
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """Take a step with the solver inside and correct it; error and solver's state are those of `diffrax_contract`."""
+        """Take a step with the solver inside and correct it; its error and state are those of `diffrax_contract`."""
         # Solvers that begin with the last derivative of the step before must not where the state has moved since.
         switching = len(args.sides(y0)) > 0
         made_jump = True if switching or (self.after_step and args.method.moves_after_steps) else made_jump

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import formulation as named_formulation
@@ -31,6 +31,7 @@ from linkax.simulation.integrate.options import (
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import all_concrete, concrete
 
 DEFAULT_FORMULATION = TangentSpace()
@@ -125,7 +126,7 @@ class Run(eqx.Module):
     def has_discrete_adjoint(self) -> bool:
         """Whether derivatives go over the accepted steps: the default where it can be."""
         solver, saveat, event, max_steps = (getattr(self.options, name) for name in _DECIDE)
-        default = self.options.adjoint is None
+        default = self.options.adjoint is None and saveat is not None
         return default and saves_states(saveat) and has_discrete_adjoint(solver, saveat, event, max_steps)
 
     @property

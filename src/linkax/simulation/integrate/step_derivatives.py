@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.projected_solver import ProjectedSolver
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise
 from linkax.xla.one_kernel import where_finite
 from linkax.xla.products_as_sums import with_products_as_sums
@@ -35,8 +36,8 @@ class InitialValueProblem(NamedTuple):
 class Steps(NamedTuple):
     """The accepted steps of an integration: their ends, (s + 1, ...), the start first, and how many there are."""
 
-    ts: Float[Array, " s+1"]
-    ys: Float[Array, "s+1 n"]
+    ts: Float[Array, " ends"]
+    ys: Float[Array, "ends n"]
     count: Int[Array, ""]
 
 
@@ -45,7 +46,7 @@ class Trajectory(NamedTuple):
 
     saved: Float[Array, "k n"] | None
     end: Float[Array, " n"]
-    steps: Float[Array, "s+1 n"] | None = None
+    steps: Float[Array, "ends n"] | None = None
 
 
 class Tableau(NamedTuple):

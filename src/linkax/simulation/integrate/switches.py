@@ -15,6 +15,7 @@ from jax import lax
 from linkax.equations.configuration import configure
 from linkax.equations.motion import move
 from linkax.model.forces import has_switch
+from linkax.xla.arrays import Array
 
 SAMPLES = 8  # of a step: between two of them a force element must not switch twice
 ON_ULPS = 256.0  # of a switch: what counts as there
@@ -27,7 +28,7 @@ class Held(eqx.Module):
     """A force element held on one side of its switch."""
 
     force: eqx.Module
-    side: jax.Array
+    side: Array
 
     def applied(self, t, motion):
         return self.force.applied(t, motion, self.side > 0.0)

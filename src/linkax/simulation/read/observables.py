@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import along_speeds, beam_point, configure
 from linkax.equations.coordinates import rates
@@ -18,6 +18,7 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.least_multipliers import LeastMultipliers, least_multipliers
 from linkax.spatial.rotations import rotate
 from linkax.spatial.vectors import cross, largest
+from linkax.xla.arrays import Array
 
 UNCHANGED = 1e-6  # by a self-stress of magnitude one
 

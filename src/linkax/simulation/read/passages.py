@@ -204,7 +204,7 @@ def _polished(solution, pair, time, q) -> _Found:
 
 
 class _Change(NamedTuple):
-    """J at a state times its right inverse G at an earlier one, and J G there, which projects on the independent rows."""
+    """J times its right inverse G at an earlier state, and J G there, which projects on the independent rows."""
 
     change: np.ndarray
     projector: np.ndarray

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.equations.system import system_of
@@ -30,6 +30,7 @@ from linkax.simulation.read.observables import Observables, Pose, Power, Violati
 from linkax.simulation.read.passages import Passages, passages
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import Program, all_concrete, concrete
 
 FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling

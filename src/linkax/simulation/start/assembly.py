@@ -26,6 +26,7 @@ from linkax.simulation.start.validation import (
     coordinates_by_joint,
     sound_numbers,
 )
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import all_concrete, quick_compile
 
 
@@ -149,11 +150,11 @@ class _Remainder(eqx.Module):
     """What stays open, for the error message; of each beam the largest change of a strain, and its energy."""
 
     gap: Gap
-    length: jax.Array
+    length: Array
     positions: JointValues
     speeds: JointValues
-    off_branch: jax.Array
-    undecided: jax.Array
+    off_branch: Array
+    undecided: Array
     strained: dict
 
     @property

@@ -17,6 +17,7 @@ from linkax.simulation.start.initial_state import ON_BRANCH
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.vectors import largest
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise, pushforward, ratio
 from linkax.xla.tracing import quick_compile
 
@@ -32,9 +33,9 @@ class _Asked(eqx.Module):
     """The equations for speeds, over `scale`: rows @ v = right (loops, and speeds held), and v on a branch."""
 
     crossing: ConstraintSplit
-    rows: jax.Array
-    right: jax.Array
-    scale: jax.Array
+    rows: Array
+    right: Array
+    scale: Array
 
     def rest(self, v):
         """The residual of the equations at speeds v."""

@@ -16,6 +16,7 @@ from linkax.model.terms import Term
 from linkax.simulation.start.nearest_solution import elastic_energy, nearest_solution, nearest_solution_in, strains_of
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import pushforward, ratio
 from linkax.xla.static_scatter import scatter_static
 
@@ -34,7 +35,7 @@ class LoopClosure(eqx.Module):
     """The problem of closing the loops at time t, with coordinates of some joints held at values."""
 
     system: System
-    t: jax.Array
+    t: Array
     held: JointValues
 
     def misses(self, configuration):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import configure
 from linkax.equations.gaps import gaps
@@ -16,6 +16,7 @@ from linkax.formulations.projected_state import ranks_along
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
+from linkax.xla.arrays import Array
 
 MOVES = 1e-6  # of the largest speed
 SINGULAR_ULPS = 8.0  # times the number of speeds: what rounding leaves of a singular mass matrix

@@ -1,7 +1,9 @@
 """A state of motion."""
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from linkax.xla.arrays import Array
 
 
 class State(eqx.Module):
@@ -12,5 +14,5 @@ class State(eqx.Module):
     `linkax.assemble` makes one on the closed loops from the joints' names.
     """
 
-    q: Float[Array, " n_q"]
-    v: Float[Array, " n_v"]
+    q: Float[Array, "*batch n_q"]
+    v: Float[Array, "*batch n_v"]

@@ -9,13 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
 
 from linkax.model.functions import Law
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import is_finite, namespace, number, real, require, require_type
 from linkax.model.terms import Term, term
 from linkax.simulation.start.state import State
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import concrete
 
 
@@ -27,9 +28,9 @@ class JointValues(eqx.Module):
     """
 
     terms: tuple[Term, ...] = eqx.field(static=True)
-    values: tuple[jax.Array, ...]
+    values: tuple[Array, ...]
 
-    def speeds(self, motion) -> list[jax.Array]:
+    def speeds(self, motion) -> list[Array]:
         """Read the speeds of these joints in a motion, in the shapes of `values`."""
         of_joint = lambda along: motion.joint_speeds(along.joint)
         return [of_joint(along) if along.index is None else of_joint(along)[along.index][None] for along in self.terms]
