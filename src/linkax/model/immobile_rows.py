@@ -13,7 +13,7 @@ import numpy as np
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import Constant
-from linkax.model.topology import SpanningTree
+from linkax.model.spanning_tree import SpanningTree
 
 PARALLEL = 1e-14
 Orientations = dict[str, np.ndarray | None]  # of bodies at coordinate zero; None where traced

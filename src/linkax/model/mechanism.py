@@ -16,7 +16,8 @@ from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import listed, require_bool
-from linkax.model.topology import GROUND_INDEX, SpanningTree, Topology, spanning_tree
+from linkax.model.spanning_tree import SpanningTree, spanning_tree
+from linkax.model.topology import GROUND_INDEX, Topology
 
 
 class Mechanism(eqx.Module):

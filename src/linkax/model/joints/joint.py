@@ -180,7 +180,7 @@ class AbstractJoint(eqx.Module):
 
     @staticmethod
     def combined(
-        rotations: Float[Array, " r"], translations: Float[Array, " t"], parameter: Scalar | None
+        rotations: Float[Array, " r"], translations: Float[Array, " t"], parameter: Scalar
     ) -> Float[jax.Array, ""]:
         """The row that combines others; `parameter` is the joint's own in units of ℓ."""
         raise NotImplementedError

@@ -1,0 +1,117 @@
+"""Forces along joints: torques on hinges, forces on slides, and their opposites on the parent."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from linkax.model.elements import Configuration, Motion
+from linkax.model.forces import AbstractForce, Load
+from linkax.model.functions import Law, evaluated, number_or_law
+from linkax.model.numbers import Number, number, positive, zero_or_more
+from linkax.model.terms import Term, TermLike, term
+from linkax.xla.arrays import Scalar
+
+
+class _AlongJoint(AbstractForce):
+    """A torque, or a force on a slide, along one speed of a joint, and its opposite on the parent."""
+
+    joint: Term = eqx.field(static=True)
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return (self.joint,)
+
+    @abc.abstractmethod
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+        """Along the joint, on the child [N m or N]."""
+
+    def load(self, t: Number, motion: Motion) -> Load:
+        return motion.joint_load(self.joint, self.torque_at(t, motion))
+
+
+class JointTorque(_AlongJoint):
+    """A torque [N m], or force [N] on a slide, along a joint; on the child, and its opposite on the parent.
+
+    **Arguments:**
+
+    - `joint`: a joint's name, or (name, index) for one of several speeds.
+    - `torque`: a number, or a function (t, motion) ↦ number; what `motion` tells is in
+      `linkax.Motion`. What the function reads is as for `linkax.Drive`.
+    """
+
+    torque: Scalar | Law
+
+    def __init__(self, joint: TermLike, torque: Number | Callable[[Any, Any], Number]):
+        self.joint = term(joint, "JointTorque")
+        self.torque = number_or_law(torque, (), f"JointTorque on {self.joint.joint!r}: torque [N m or N]")
+
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+        return evaluated(self.torque, t, motion)
+
+
+class JointSpring(_AlongJoint):
+    """A linear spring along a joint: −stiffness × (coordinate − free).
+
+    At a joint that is cut (where all joints of a loop have springs, say) the angle is read in
+    (−π, π] from `free`: the spring forgets whole turns.
+
+    **Arguments:** `joint`: a name, or (name, index); `stiffness` [N m/rad or N/m]; `free`: the
+    coordinate at which it is unstrained [rad or m].
+    """
+
+    stiffness: Scalar
+    free: Scalar
+
+    def __init__(self, joint: TermLike, stiffness: Number, free: Number = 0.0):
+        self.joint = term(joint, "JointSpring")
+        what = f"JointSpring on {self.joint.joint!r}"
+        self.stiffness = number(stiffness, (), f"{what}: stiffness [N m/rad or N/m]")
+        self.free = number(free, (), f"{what}: free [rad or m]")
+
+    @property
+    def needs_coordinate(self) -> bool:
+        return True
+
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+        return -self.stiffness * motion.configuration.joint_displacement(self.joint, self.free)
+
+    def potential_energy(self, configuration: Configuration) -> Scalar:
+        return self.stiffness * configuration.joint_displacement(self.joint, self.free) ** 2 / 2.0
+
+
+class JointDamper(_AlongJoint):
+    """Viscous damping along a joint: −damping × speed, `damping` in N m s/rad or N s/m."""
+
+    damping: Scalar
+
+    def __init__(self, joint: TermLike, damping: Number):
+        self.joint = term(joint, "JointDamper")
+        self.damping = number(damping, (), f"JointDamper on {self.joint.joint!r}: damping [N m s/rad or N s/m]")
+
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+        return -self.damping * motion.joint_rate(self.joint)
+
+
+class JointFriction(_AlongJoint):
+    """Coulomb friction along a joint, regularised: −torque × tanh(speed / scale).
+
+    Below `scale` [rad/s or m/s] it is nearly viscous, so that a joint at rest under a load creeps;
+    at three scales it has 99.5 % of `torque` [N m or N]. The smaller the scale, the stiffer.
+
+    **Raises:** `ValueError` for a negative torque, or a scale that is not positive.
+    """
+
+    torque: Scalar
+    scale: Scalar
+
+    def __init__(self, joint: TermLike, torque: Number, scale: Number):
+        self.joint = term(joint, "JointFriction")
+        what = f"JointFriction on {self.joint.joint!r}"
+        self.torque = zero_or_more(torque, f"{what}: torque [N m or N]")
+        self.scale = positive(scale, f"{what}: scale [rad/s or m/s]")
+
+    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+        return -self.torque * jnp.tanh(motion.joint_rate(self.joint) / self.scale)

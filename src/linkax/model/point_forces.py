@@ -1,0 +1,157 @@
+"""Forces on points of bodies, and between two points."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from linkax.model.bodies import GROUND_NAME, BodyOrFrame, Frame, frame_of
+from linkax.model.elements import Configuration, Motion
+from linkax.model.forces import AbstractForce, Load, described, named
+from linkax.model.functions import Law, evaluated, number_or_law
+from linkax.model.numbers import Number, Vector, number, one_of, zero_or_more
+from linkax.spatial.vectors import dot
+from linkax.xla.arrays import Array, Scalar
+
+Axes = Literal["ground", "frame"]
+
+
+class _BetweenPoints(AbstractForce):
+    """A force along the line between the origins of two frames."""
+
+    first: Frame
+    second: Frame
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        return (self.first, self.second)
+
+    @abc.abstractmethod
+    def pull(self, motion: Motion) -> Float[Array, "3"]:
+        """The force on the first point; its opposite acts on the second [N]."""
+
+    def load(self, t: Number, motion: Motion) -> Load:
+        force = self.pull(motion)
+        return motion.point_load(self.first, force).plus(motion.point_load(self.second, -force))
+
+
+def _unit(vector: Float[Array, "3"]) -> Float[jax.Array, "3"]:
+    """The direction of a vector; zero for none."""
+    square = dot(vector, vector)
+    return jnp.where(square > 0.0, vector / jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
+
+
+class Spring(_BetweenPoints):
+    """A linear spring between two points; it pulls with stiffness × (distance − free_length).
+
+    Where the points meet it has no direction, and a free length pushes nowhere.
+
+    **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`;
+    `stiffness` [N/m]; `free_length` [m], zero or more.
+    """
+
+    stiffness: Scalar
+    free_length: Scalar
+
+    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, stiffness: Number, free_length: Number = 0.0):
+        self.first, self.second = _frames("Spring", first, second)
+        self.stiffness = number(stiffness, (), f"{self.display_name}: stiffness [N/m]")
+        self.free_length = zero_or_more(free_length, f"{self.display_name}: free_length [m]")
+
+    def pull(self, motion: Motion) -> Float[Array, "3"]:
+        along = motion.configuration.between(self.first, self.second)
+        return self.stiffness * (along - self.free_length * _unit(along))
+
+    def potential_energy(self, configuration: Configuration) -> Scalar:
+        along = configuration.between(self.first, self.second)
+        stretch = dot(along, _unit(along)) - self.free_length
+        return self.stiffness * stretch**2 / 2.0
+
+
+class Damper(_BetweenPoints):
+    """Viscous damping between two points: pulls with `damping` [N s/m] × the rate of their distance.
+
+    `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
+    """
+
+    damping: Scalar
+
+    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, damping: Number):
+        self.first, self.second = _frames("Damper", first, second)
+        self.damping = number(damping, (), f"{self.display_name}: damping [N s/m]")
+
+    def pull(self, motion: Motion) -> Float[Array, "3"]:
+        direction = _unit(motion.configuration.between(self.first, self.second))
+        rate = dot(motion.point_velocity(self.second) - motion.point_velocity(self.first), direction)
+        return self.damping * rate * direction
+
+
+class _OnPoint(AbstractForce):
+    """A vector on a point of a body, in ground axes or in those of the frame there."""
+
+    point: Frame
+    axes: Axes = eqx.field(static=True)
+
+    def __init__(self, point: BodyOrFrame, axes: Axes):
+        self.point = frame_of(point, f"{type(self).__name__}: point")
+        if self.point.body == GROUND_NAME:
+            raise ValueError(
+                f"{self.display_name}: point is {point!r}, which nothing moves; give a point of another body"
+            )
+        self.axes = one_of(axes, ("ground", "frame"), f"{self.display_name}: axes")
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        return (self.point,)
+
+    def _in_ground_axes(self, entry: Array | Law, t: Number, motion: Motion) -> Float[Array, "3"]:
+        vector = evaluated(entry, t, motion)
+        return motion.configuration.axes(self.point) @ vector if self.axes == "frame" else vector
+
+
+class PointForce(_OnPoint):
+    """A force on a point of a body.
+
+    **Arguments:**
+
+    - `point`: a body (its reference frame), or `body.at(...)`.
+    - `force`: three numbers [N], or a function (t, motion) ↦ three numbers; see `JointTorque`.
+    - `axes`: "ground" (default), or "frame": those of the frame at the point, which turn with it.
+    """
+
+    force: Float[Array, "3"] | Law
+
+    def __init__(self, point: BodyOrFrame, force: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground"):
+        super().__init__(point, axes)
+        self.force = number_or_law(force, (3,), f"{self.display_name}: force [N]")
+
+    def load(self, t: Number, motion: Motion) -> Load:
+        return motion.point_load(self.point, self._in_ground_axes(self.force, t, motion))
+
+
+class PointMoment(_OnPoint):
+    """A moment on a body; on a beam, on its section at the point.
+
+    **Arguments:** like those of `PointForce`, with `moment`: three numbers [N m], or a function.
+    """
+
+    moment: Float[Array, "3"] | Law
+
+    def __init__(self, point: BodyOrFrame, moment: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground"):
+        super().__init__(point, axes)
+        self.moment = number_or_law(moment, (3,), f"{self.display_name}: moment [N m]")
+
+    def load(self, t: Number, motion: Motion) -> Load:
+        nothing = jnp.zeros(3, motion.system.dtype)
+        return motion.point_load(self.point, nothing, self._in_ground_axes(self.moment, t, motion))
+
+
+def _frames(kind: str, first: BodyOrFrame, second: BodyOrFrame) -> tuple[Frame, Frame]:
+    ends = frame_of(first, f"{kind}: first point"), frame_of(second, f"{kind}: second point")
+    if ends[0].body == ends[1].body:
+        raise ValueError(f"{described(kind, named(ends[:1]))}: both points are on it; give points on two bodies")
+    return ends
