@@ -99,7 +99,8 @@ class Configuration(eqx.Module):
 
     def point(self, frame: Frame) -> Float[Array, "3"]:
         """Origin of a frame in the world [m]."""
-        return sum(self._place(frame))
+        place, anchor = self._place(frame)
+        return place + anchor
 
     def between(self, first: Frame, second: Frame) -> Float[Array, "3"]:
         """Vector from the origin of one frame to that of another [m]."""
@@ -139,7 +140,8 @@ class Configuration(eqx.Module):
         """Type, axes on the parent, and index of a cut joint."""
         topology = self.system.topology
         joint = topology.joints.index(name)
-        return topology.joint_types[joint], self.joint_axes[joint], joint - topology.num_bodies
+        cut = joint - topology.num_bodies
+        return topology.cut_types[cut], self.joint_axes[joint], cut
 
     def cut_subspace(self, name: str):
         """Motion subspace of a cut joint in ground axes, angular and linear part, (n, 3) each.

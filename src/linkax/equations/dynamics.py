@@ -17,7 +17,7 @@ from linkax.linalg.static_sparse import StaticSparse, constant_product, products
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 
 
 def world_inertia(configuration: Configuration) -> Float[Array, "n_b 3 3"]:
@@ -117,7 +117,7 @@ def kinetic_energy(motion: Motion) -> Float[Array, ""]:
     return jnp.sum(motion.system.mass * dot(velocity, velocity) + dot(omega, spin)) / 2.0
 
 
-def potential_energy(configuration: Configuration) -> Float[Array, ""]:
+def potential_energy(configuration: Configuration) -> Scalar:
     """Potential energy of all force elements that have one [J]."""
     energies = [force.potential_energy(configuration) for force in configuration.system.forces]
     return sum(energies, jnp.zeros((), configuration.system.dtype))

@@ -21,7 +21,7 @@ FLIP_WEIGHT = 2.0  # more than one: axes that point apart are farther from being
 def locked_separation(configuration: Configuration) -> Float[Array, "n_cut 3"]:
     """The part of the separations along locked directions, in joint axes of the parent [m]."""
     topology = configuration.system.topology
-    kinds = topology.joint_types[topology.num_bodies :]
+    kinds = topology.cut_types
     locked = np.array([[i in kind.locked_translations for i in range(3)] for kind in kinds]).reshape(-1, 3)
     return jnp.where(locked, rotate(transpose(configuration.parent_axes), configuration.separation), 0.0)
 
@@ -42,7 +42,7 @@ def flips(configuration: Configuration):
     Locked rotations alone would also be satisfied by axes that point opposite ways.
     """
     topology = configuration.system.topology
-    kinds = topology.joint_types[topology.num_bodies :]
+    kinds = topology.cut_types
     rows = chosen_rows(configuration, [(cut, i, i) for cut, kind in enumerate(kinds) for i in kind.aligned_axes], [])
     cosine, slopes = row_residual(configuration, rows), row_jacobian(configuration, rows).dense()
     apart = cosine < 0.0
@@ -73,7 +73,7 @@ class Gap(NamedTuple):
 def gaps(configuration: Configuration) -> Gap:
     """How far constraints are open, rows that no motion changes included."""
     system, topology = configuration.system, configuration.system.topology
-    kinds = topology.joint_types[topology.num_bodies :]
+    kinds = topology.cut_types
     held = np.array([[i in kind.aligned_axes for i in range(3)] for kind in kinds]).reshape(-1, 3)
     parent_axes, child_axes = configuration.parent_axes, configuration.child_axes
     across = jnp.linalg.norm(cross(transpose(parent_axes), transpose(child_axes)), axis=-1)

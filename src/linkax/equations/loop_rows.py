@@ -62,7 +62,7 @@ def immobile_rows(configuration: Configuration) -> RowVectors:
 def combined_rows(configuration: Configuration) -> RowVectors:
     """The rotation and translation rows that combined rows are functions of."""
     topology = configuration.system.topology
-    kinds = topology.joint_types[topology.num_bodies :]
+    kinds = topology.cut_types
     rotations = [(cut, i, j) for cut in topology.combining for i, j in kinds[cut].combined_rotations]
     translations = [(cut, i) for cut in topology.combining for i in kinds[cut].combined_translations]
     return chosen_rows(configuration, rotations, translations)
@@ -71,7 +71,7 @@ def combined_rows(configuration: Configuration) -> RowVectors:
 def combine(system: System, rows: Float[Array, " n"]) -> Float[Array, " n_combined"]:
     """Combined rows from those of `combined_rows`."""
     topology, found = system.topology, []
-    kinds = topology.joint_types[topology.num_bodies :]
+    kinds = topology.cut_types
     count = sum(len(kinds[cut].combined_rotations) for cut in topology.combining)
     rotations, translations = rows[:count], rows[count:]
     for cut in topology.combining:

@@ -52,12 +52,12 @@ def ropes(system: System) -> list[tuple[int, Rope]]:
 def residual(configuration: Configuration) -> Float[Array, " m"]:
     """c(q, t) of c = 0: the rows that motion can change, (m,)."""
     system = configuration.system
-    rows = [row_residual(configuration, plain_rows(configuration))]
+    rows: list[Array] = [row_residual(configuration, plain_rows(configuration))]
     if system.topology.combining:
         rows.append(combine(system, row_residual(configuration, combined_rows(configuration))))
     if system.constraints:
         coordinates = coordinates_by_speed(system.topology, configuration.q)
-        values = system.coupling @ coordinates
+        values = jnp.asarray(system.coupling @ coordinates)
         for row, rope in ropes(system):
             values = values.at[row].set(rope.value(configuration))
         rows.append(values / system.coupling_unit - _right_sides(system, configuration.t))
@@ -82,7 +82,7 @@ def jacobian_entries(configuration: Configuration) -> StaticSparse:
         values, slopes = combination(configuration)
         rows.append(StaticSparse.whole(combining_factors(configuration, values) @ slopes))
     if system.constraints:
-        slopes = system.coupling
+        slopes = jnp.asarray(system.coupling)
         for row, rope in ropes(system):
             unit_load = rope.load(configuration, 1.0)
             slopes = slopes.at[row].set(along_speeds(configuration, unit_load.force, unit_load.moment))

@@ -54,7 +54,8 @@ def _added(reaction: Reaction, rows: RowVectors, multipliers) -> Reaction:
     moments = of_rotations[:, None] * cross(rows.second, rows.first)
     forces = (of_translations / rows.length)[:, None] * rows.direction
     return Reaction(
-        reaction.force.at[rows.translation_cut].add(forces), reaction.moment.at[rows.rotation_cut].add(moments)
+        jnp.asarray(reaction.force).at[rows.translation_cut].add(forces),
+        jnp.asarray(reaction.moment).at[rows.rotation_cut].add(moments),
     )
 
 
@@ -83,7 +84,7 @@ def seen_from(configuration: Configuration, reactions: Reaction, on: Side, axes:
     force, moment = reactions
     joint_axes = configuration.joint_axes
     if on == "parent":
-        apart = configuration.parent_arm - rotate(configuration.rotation[parent], system.parent_offset)
+        apart = jnp.asarray(configuration.parent_arm - rotate(configuration.rotation[parent], system.parent_offset))
         apart = apart.at[topology.num_bodies :].add(configuration.separation)
         force, moment = -force, -moment - cross(apart, force)
     elif axes == "joint":

@@ -28,8 +28,10 @@ class Structure(NamedTuple):
     elimination: EliminationPlan | None
 
     def ranks_of_islands(self, ranks):
-        """Add up the ranks of fronts, (k,), for each island."""
+        """Add up the ranks of fronts, (k,), for each island; without fronts they are those of islands."""
         plan = self.elimination
+        if plan is None:
+            return ranks
         first = [
             min((*interior, *separator)) for interior, separator in zip(plan.interior, plan.separator, strict=True)
         ]
@@ -54,6 +56,5 @@ def _islands(topology):
         label[np.isin(label, label[together])] = np.min(label[together], initial=topology.num_speeds)
     row_label = np.array([label[columns[0]] if len(columns) else 0 for columns in topology.read_by_rows], dtype=int)
     return tuple(
-        Island(tuple(np.flatnonzero(row_label == part)), tuple(np.flatnonzero(label == part)))
-        for part in np.unique(label)
+        Island(*(tuple(np.flatnonzero(of == part).tolist()) for of in (row_label, label))) for part in np.unique(label)
     )

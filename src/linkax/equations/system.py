@@ -92,7 +92,8 @@ def system_of(mechanism: Mechanism, dtype, fixed_scales: bool = True) -> System:
     fixed = lax.stop_gradient if fixed_scales else lambda array: array
     bends = np.array([joint.kind.motion is not None for joint in joints], dtype=bool)
     reach = stack([joint.length_estimate for joint in joints], ()) if np.any(bends) else None
-    loop_length, length = _lengths(topology, *map(fixed, (parent_offset, child_offset, center_of_mass)), reach)
+    ends = fixed(parent_offset), fixed(child_offset)
+    loop_length, length = _lengths(topology, *ends, fixed(center_of_mass), reach)
     coupling = _coupling(mechanism, dtype)
     slides = jnp.where(topology.slides, length, jnp.ones((), dtype))
     return System(

@@ -2,12 +2,11 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.scipy.linalg import cho_factor, cho_solve
 
 from linkax.formulations.classical import AbstractAcceleration, parameter
-from linkax.model.numbers import whole_number
+from linkax.model.numbers import Number, whole_number
 
 
 class AugmentedLagrangian(AbstractAcceleration):
@@ -21,7 +20,7 @@ class AugmentedLagrangian(AbstractAcceleration):
     - `sweeps`: how often, one or more; one is the penalty method.
     """
 
-    penalty: np.ndarray = parameter(1e7, "penalty of AugmentedLagrangian")
+    penalty: Number = parameter(1e7, "penalty of AugmentedLagrangian")
     sweeps: int = eqx.field(static=True, default=10)
 
     def __check_init__(self):

@@ -5,7 +5,6 @@ from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Float
 
@@ -15,7 +14,7 @@ from linkax.equations.loops import gamma, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Dynamics, LinearSystem, linear_system
-from linkax.model.numbers import whole_number, zero_or_more
+from linkax.model.numbers import Number, whole_number, zero_or_more
 from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
 from linkax.xla.tracing import jit_inline
@@ -53,8 +52,8 @@ class Baumgarte(eqx.Module):
     - `alpha`, `beta` [1/s]: zero for none.
     """
 
-    alpha: np.ndarray = parameter(5.0, "alpha of Baumgarte [1/s]")
-    beta: np.ndarray = parameter(5.0, "beta of Baumgarte [1/s]")
+    alpha: Number = parameter(5.0, "alpha of Baumgarte [1/s]")
+    beta: Number = parameter(5.0, "beta of Baumgarte [1/s]")
 
 
 _solve = one_by_one(jnp.linalg.solve)

@@ -5,6 +5,8 @@ acceleration, so γ must lie in the range of J: uᵀγ(v, v) = 0 for every u wit
 equations for the speeds, whose solutions are the branches.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -58,7 +60,7 @@ class ConstraintSplit(eqx.Module):
         size = length(basis / self.configuration.system.scales[:, None], axis=0)
         return basis / jnp.where(size > 0.0, size, 1.0)
 
-    def off_branch(self, v, scale=1.0) -> Float[Array, " m"]:
+    def off_branch(self, v, scale: Any = 1.0) -> Float[Array, " m"]:
         """The part of γ(v, v) outside the range of J, (m,): zero for speeds on a branch.
 
         **Arguments:** `scale`: a factor of the speeds v, whose square is one of γ.

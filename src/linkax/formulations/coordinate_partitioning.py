@@ -1,9 +1,8 @@
 """Generalised coordinate partitioning as a correction."""
 
-import numpy as np
-
 from linkax.formulations.classical import AbstractCorrection, parameter
 from linkax.linalg.right_inverse import by_partition
+from linkax.model.numbers import Number
 
 
 class CoordinatePartitioning(AbstractCorrection):
@@ -15,7 +14,7 @@ class CoordinatePartitioning(AbstractCorrection):
     - `tolerance`: a pivot below that much of the first one is none; its row is left out.
     """
 
-    tolerance: np.ndarray = parameter(1e-6, "tolerance of CoordinatePartitioning")
+    tolerance: Number = parameter(1e-6, "tolerance of CoordinatePartitioning")
 
     def right_inverse(self, mass, jacobian):
         return by_partition(jacobian, self.tolerance)

@@ -1,7 +1,7 @@
 """What a formulation is: how equations of motion with loops become an ordinary differential equation."""
 
 import abc
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Float
@@ -61,7 +61,7 @@ class AbstractFormulation(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def distance_floor(self):
+    def distance_floor(self) -> Any:
         """The distance d from a singular configuration below which rounding grows no more."""
 
     @property
@@ -70,7 +70,7 @@ class AbstractFormulation(eqx.Module):
         """Whether `correct` moves a state to where its derivative is another one."""
 
     @abc.abstractmethod
-    def derivative(self, system: System, t, q, v, correct):
+    def derivative(self, system: System, t: Any, q: Any, v: Any, correct: Any) -> Any:
         """Compute (v, v̇, q, d): speeds, accelerations, where they hold, and the distance from a singular
         configuration.
 
@@ -79,13 +79,13 @@ class AbstractFormulation(eqx.Module):
         """
 
     @abc.abstractmethod
-    def correct(self, system: System, t, q, v, errors=()):
+    def correct(self, system: System, t: Any, q: Any, v: Any, errors: Any = ()) -> Any:
         """Correct the state after a step: (q, v, what remains of `errors` in it, d)."""
 
     @abc.abstractmethod
-    def close(self, system: System, t, q, v):
+    def close(self, system: System, t: Any, q: Any, v: Any) -> Any:
         """Compute q and v as they are saved and read."""
 
     @abc.abstractmethod
-    def dynamics(self, system: System, t, q, v) -> Dynamics:
+    def dynamics(self, system: System, t: Any, q: Any, v: Any) -> Dynamics:
         """Compute accelerations and multipliers at a saved state."""

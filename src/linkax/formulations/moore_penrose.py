@@ -4,11 +4,11 @@ from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from linkax.formulations.classical import AbstractAcceleration, AbstractCorrection, parameter
 from linkax.linalg.right_inverse import by_gram_schmidt, by_svd
+from linkax.model.numbers import Number
 
 INVERSES = {"svd": by_svd, "gram-schmidt": by_gram_schmidt}
 
@@ -34,7 +34,7 @@ class MoorePenrose(AbstractAcceleration):
     """
 
     inverse: Literal["svd", "gram-schmidt"] = eqx.field(static=True, default="svd")
-    tolerance: np.ndarray = parameter(1e-6, "tolerance of MoorePenrose")
+    tolerance: Number = parameter(1e-6, "tolerance of MoorePenrose")
 
     def __check_init__(self):
         if self.inverse not in INVERSES:
@@ -53,7 +53,7 @@ class MassOrthogonalProjection(AbstractCorrection):
     - `tolerance`: see `MoorePenrose`.
     """
 
-    tolerance: np.ndarray = parameter(1e-6, "tolerance of MassOrthogonalProjection")
+    tolerance: Number = parameter(1e-6, "tolerance of MassOrthogonalProjection")
 
     def right_inverse(self, mass, jacobian):
         return mass_orthogonal_inverse(mass, jacobian, by_svd, self.tolerance)

@@ -204,8 +204,8 @@ def _multipliers_at(arguments, t, q) -> Value:
     method, system, v = arguments
     found = evaluate((method, system, t, q, v), True)
     rows, rank = linear_system(system, t, found.q).jacobian, jnp.sum(found.split.rank)
-    least = least_multipliers(rows, found.multipliers, system.scales, method.rank_tolerance, rank)
-    undefined = (found.split.distance < method.rank_tolerance) & jnp.any(v != 0.0)
+    least = least_multipliers(rows, found.multipliers, system.scales, method.tolerance, rank)
+    undefined = (found.split.distance < method.tolerance) & jnp.any(v != 0.0)
     per_inertia = jnp.where(undefined, jnp.nan, least.multipliers / _inertia(system))
     return Value((found.q, per_inertia), found.split.distance, _gap(system, t, q))
 

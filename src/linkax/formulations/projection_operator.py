@@ -1,10 +1,10 @@
 """The projection operator onto the tangent space."""
 
 import jax.numpy as jnp
-import numpy as np
 
 from linkax.formulations.classical import AbstractAcceleration, parameter
 from linkax.linalg.right_inverse import by_svd
+from linkax.model.numbers import Number
 
 
 class ProjectionOperator(AbstractAcceleration):
@@ -15,7 +15,7 @@ class ProjectionOperator(AbstractAcceleration):
     - `tolerance`: singular values of J below that much of the largest one count as zero.
     """
 
-    tolerance: np.ndarray = parameter(1e-6, "tolerance of ProjectionOperator")
+    tolerance: Number = parameter(1e-6, "tolerance of ProjectionOperator")
 
     def __call__(self, mass, jacobian, force, gamma):
         back = by_svd(jacobian, self.tolerance)

@@ -1,6 +1,7 @@
 """Many classical formulations in one program, by `lax.switch`."""
 
 import dataclasses
+from typing import Any, cast
 
 import numpy as np
 from jax import lax
@@ -42,8 +43,8 @@ def in_one_program(formulations: list[ClassicalFormulation]) -> list[ClassicalFo
         corrections = tuple(formulations[place].correction for place in group)
         for index, place in enumerate(group):
             number = np.asarray(index)
-            shared = {"acceleration": _OneAcceleration(accelerations, number)}
+            shared: dict[str, Any] = {"acceleration": _OneAcceleration(accelerations, number)}
             if corrected:
-                shared["correction"] = _OneCorrection(corrections, number)
+                shared["correction"] = _OneCorrection(cast(tuple[AbstractCorrection, ...], corrections), number)
             found[place] = dataclasses.replace(formulations[place], **shared)
     return found

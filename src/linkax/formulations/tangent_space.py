@@ -104,9 +104,15 @@ class TangentSpace(AbstractFormulation):
         return eqx.tree_at(numbers, self, (tolerance, ranks), is_leaf=lambda leaf: leaf is None)
 
     @property
-    def distance_floor(self):
-        """τ: below it rows count as dependent."""
+    def tolerance(self) -> Array:
+        """τ of a formulation that was prepared."""
+        assert self.rank_tolerance is not None
         return self.rank_tolerance
+
+    @property
+    def distance_floor(self) -> Array:
+        """τ: below it rows count as dependent."""
+        return self.tolerance
 
     @property
     def moves_after_steps(self) -> bool:
@@ -188,12 +194,12 @@ class TangentSpace(AbstractFormulation):
         weight = linear.mass if self.metric == "mass" else None
         system = linear.configuration.system
         islands, ranks = system.structure.islands, self._ranks_of_islands(system)
-        return invert_apart(weight, linear.jacobian, system.scales, self.rank_tolerance, islands, ranks)
+        return invert_apart(weight, linear.jacobian, system.scales, self.tolerance, islands, ranks)
 
     def _split_by_blocks(self, linear, blocks) -> BlockInverse:
         system = linear.configuration.system
         plan = system.structure.elimination
-        return invert_by_blocks(blocks, system.scales, self.rank_tolerance, plan, self.rank_nearby)
+        return invert_by_blocks(blocks, system.scales, self.tolerance, plan, self.rank_nearby)
 
     def _with_mass(self, linear, split):
         """The inverse with M in place of W, for the same split."""
@@ -212,9 +218,7 @@ class TangentSpace(AbstractFormulation):
 
     def _ranks_of_islands(self, system):
         """`rank_nearby` of the islands."""
-        if system.structure.elimination is None or self.rank_nearby is None:
-            return self.rank_nearby
-        return system.structure.ranks_of_islands(self.rank_nearby)
+        return None if self.rank_nearby is None else system.structure.ranks_of_islands(self.rank_nearby)
 
     @jit_inline
     def derivative(self, system: System, t, q, v, correct):
@@ -288,7 +292,7 @@ class TangentSpace(AbstractFormulation):
         linear = linear_system(system, t, q)
         weight = linear.mass if self.metric == "mass" else None
         islands, ranks = system.structure.islands, self._ranks_of_islands(system)
-        return singularity_distance(weight, linear.jacobian, system.scales, self.rank_tolerance, islands, ranks)
+        return singularity_distance(weight, linear.jacobian, system.scales, self.tolerance, islands, ranks)
 
     def at_rest(self, system: System, t, q) -> AtRest:
         """The acceleration from rest at coordinates q, and what selects its branch."""

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -67,6 +67,11 @@ class Topology:
     @property
     def num_bodies(self) -> int:
         return len(self.bodies)
+
+    @cached_property
+    def cut_types(self) -> tuple[type[AbstractJoint], ...]:
+        """The classes of the cut joints."""
+        return cast(tuple[type[AbstractJoint], ...], self.joint_types[self.num_bodies :])
 
     @property
     def num_cuts(self) -> int:

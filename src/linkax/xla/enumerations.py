@@ -10,7 +10,7 @@ def code(item):
 
 def item(numbers, enumeration):
     """The item of a number, or of each of a batch."""
-    return EnumerationItem(numbers, enumeration)
+    return EnumerationItem(numbers, enumeration)  # pyright: ignore[reportCallIssue]
 
 
 def is_item(node, enumeration) -> bool:

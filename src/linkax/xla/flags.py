@@ -16,8 +16,8 @@ from functools import cache
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 from jax import lax
+from jaxlib import version as jaxlib
 
 WHOLE_LOOP_BYTES = 2**22  # read and written by one pass of a loop
 LOOP_BYTES = "xla_cpu_small_while_loop_byte_threshold"
@@ -64,7 +64,7 @@ def makes_kernels_of_loops() -> bool:
     with jax.ensure_compile_time_eval():
         step = lambda carry: (carry[0] + 1, jnp.sin(jnp.sum(carry[1][:, :, None] * carry[1], axis=1)))
         loop = jax.jit(lambda count, matrix: lax.while_loop(lambda carry: carry[0] < 3, step, (count, matrix)))
-        program = loop.lower(0, jax.ShapeDtypeStruct((8, 8), jnp.float64)).compile().as_text()
+        program = loop.lower(0, jax.ShapeDtypeStruct((8, 8), jnp.float64)).compile().as_text() or ""
     made, flags = "xla_cpu_small_call" in program, os.environ.get("XLA_FLAGS", "")
     chosen = LOOP_BYTES in flags and LOOPS not in flags
     if not made and not chosen and jax.default_backend() == "cpu":

@@ -11,6 +11,7 @@ from functools import cache, partial, wraps
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer, eval_context
 
 from linkax.xla.flags import quickest_to_compile
 
@@ -19,12 +20,12 @@ jit_inline = eqx.filter_jit
 
 def concrete(number) -> np.ndarray | None:
     """Return a number as a NumPy array, or None while a transformation traces it."""
-    return None if isinstance(number, jax.core.Tracer) else np.asarray(number)
+    return None if isinstance(number, Tracer) else np.asarray(number)
 
 
 def all_concrete(tree) -> bool:
     """Whether no array in a tree is traced by a transformation."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 class Program:
@@ -33,7 +34,9 @@ class Program:
     def __init__(self, function):
         self.optimised = jit_inline(function)
         # XLA is asked for its options when the program runs.
-        self._quick = cache(lambda: eqx.filter_jit(function, compiler_options=quickest_to_compile()))
+        self._quick = cache(
+            lambda: eqx.filter_jit(function, compiler_options=quickest_to_compile())  # pyright: ignore[reportCallIssue]
+        )
 
     def choose(self, quick: bool, *args):
         """Choose what to call with these arguments: the quick program for concrete ones only, if asked for.
@@ -52,5 +55,5 @@ def quick_compile(function):
 def evaluate_now(function, *args):
     """Compute function(*args) of concrete arguments at once, also while a transformation is tracing."""
     # Not `jax.ensure_compile_time_eval`: with it JAX compiles each operation on constants by itself.
-    with jax.core.eval_context():
+    with eval_context():
         return function(*args)

@@ -6,6 +6,7 @@ JAX gives zero where a result does not follow its inputs, and zero says "at an o
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.flatten_util import ravel_pytree
 
 from linkax.xla.derivatives import materialise
@@ -41,7 +42,7 @@ def _spoil(undefined, linear):
 
 
 def _abstract(undefined, linear):
-    return jax.core.ShapedArray(undefined.shape, linear.dtype)
+    return ShapedArray(undefined.shape, linear.dtype)
 
 
 def _jvp(primals, changes):

@@ -42,7 +42,7 @@ def cause(solution) -> str:
         found = massless_bodies(system, method, t, state.q)
         return f" They are {_listed(found)}." if found else lost_inertia(system)
     if (result == RESULTS.no_branch) | (result == RESULTS.not_unique):
-        basis = ConstraintSplit.at(system, t, state.q, method.rank_tolerance).inverse.basis
+        basis = ConstraintSplit.at(system, t, state.q, method.tolerance).inverse.basis
         return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
     return (
         _no_acceleration(solution, system, method, t)
@@ -62,7 +62,7 @@ def _not_finite(mechanism):
         if eqx.is_inexact_array(leaf) and not np.all(np.isfinite(leaf)):
             place, which, *rest = path
             owner = getattr(getattr(mechanism, place.name)[which.idx], "name", type(leaf).__name__)
-            return f" {owner!r}{jax.tree_util.keystr(rest)} is {np.asarray(leaf).tolist()}."
+            return f" {owner!r}{jax.tree_util.keystr(tuple(rest))} is {np.asarray(leaf).tolist()}."
     return ""
 
 
@@ -184,7 +184,7 @@ def massless_bodies(system, method, t, q):
     inertia = ratio(system.inertia, moment[:, None, None], 0.0) * system.length**2
     equal = eqx.tree_at(lambda s: (s.mass, s.inertia), system, (ratio(system.mass, system.mass, 0.0), inertia))
     configuration = configure(equal, t, q)
-    basis = invert(None, jacobian(configuration), system.scales, method.rank_tolerance).basis
+    basis = invert(None, jacobian(configuration), system.scales, method.tolerance).basis
     basis = np.asarray(basis)[:, np.any(np.asarray(basis) != 0.0, axis=0)]
     values, vectors = np.linalg.eigh(basis.T @ np.asarray(mass_matrix(configuration)) @ basis / system.length**2)
     directions = basis @ vectors[:, values < NULL]

@@ -4,7 +4,7 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 
-from linkax.simulation.integrate.options import with_tolerances
+from linkax.simulation.integrate.options import save_at, with_tolerances
 from linkax.simulation.integrate.run import DEFAULT_SAVES, Run, cast
 from linkax.simulation.start.state import State
 
@@ -34,7 +34,7 @@ def refined_run(solution, factor) -> Run:
         t0=t0,
         t1=solution.t_end,
         accuracy=accuracy,
-        saveat=diffrax.SaveAt(ts=ts),
+        saveat=save_at(ts),
         controller=controller,
         dt0=dt0,
         max_steps=None if options.max_steps is None else REFINED_STEPS * options.max_steps,
@@ -47,7 +47,7 @@ def part_of_run(solution, state: State, ts) -> Run:
     By the same program where the run of the solution saves as many.
     """
     padded = np.pad(ts, (0, num_saves(solution) - len(ts)), mode="edge")
-    return solution.run.changed(state=state, t0=ts[0], t1=ts[-1], saveat=diffrax.SaveAt(ts=padded))
+    return solution.run.changed(state=state, t0=ts[0], t1=ts[-1], saveat=save_at(padded))
 
 
 def num_saves(solution) -> int:

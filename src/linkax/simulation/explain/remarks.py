@@ -1,5 +1,7 @@
 """Remarks on a run that ended well, see `linkax.REMARKS`, and their causes with the elements to blame."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -29,7 +31,7 @@ FAST = 0.5  # rate of an element that chooses the steps, times their mean length
 RESOLVED = 5.0  # the same, below which an explicit solver takes about as many steps: Dopri8's reach 2 to 3
 
 
-def remark(solution) -> REMARKS:
+def remark(solution) -> Any:
     """The first of `REMARKS` that applies to a run that ended well, or to each of a batch."""
     known, found = _known(solution), np.zeros(solution.t_end.shape, np.int32)
     numeric = np if known is np.asarray else jnp
@@ -45,7 +47,7 @@ def in_words(solution, *names) -> str:
     """Explain the first of these `REMARKS` that applies to a run, ended well or not, with numbers and elements; or
     nothing.
     """
-    for applies, tell in map(_FINDINGS.get, names):
+    for applies, tell in (_FINDINGS[name] for name in names):
         if applies(solution, np.asarray):
             return tell(solution)
     return ""

@@ -4,10 +4,10 @@ import warnings
 from typing import Literal, get_args
 
 import equinox as eqx
-import numpy as np
 
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.numbers import number, one_of, require
+from linkax.xla.arrays import Scalar
 
 Projection = Literal["both", "stage", "step", "none"]
 
@@ -32,9 +32,9 @@ class Accuracy(eqx.Module):
     **Raises:** `ValueError` for a tolerance that is not a positive number of at most 1.
     """
 
-    rtol: np.ndarray
-    atol: np.ndarray
-    clearance: np.ndarray
+    rtol: Scalar
+    atol: Scalar
+    clearance: Scalar
     projection: Projection = eqx.field(static=True)
     tangent_space: TangentSpace | None
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import ShapedArray
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
@@ -83,7 +84,7 @@ def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bo
         ((saveat.subs, end, steps) if track else (saveat.subs, end), True),
         is_leaf=lambda leaf: leaf is None,
     )
-    found = diffrax.diffeqsolve(
+    found: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
         integrator.solver,
         ivp.t0,
@@ -153,9 +154,10 @@ def _evaluate(solver, every, ivp, steps, restored, flat):
 
 def _abstract(solver, every, ivp, steps, restored, flat):
     n = ivp.y0.shape
-    of = lambda shape: jax.core.ShapedArray(shape, ivp.y0.dtype)
+    of = lambda shape: ShapedArray(shape, ivp.y0.dtype)
     saved = None if ivp.saved is None else of(ivp.saved.shape + n)
-    return Trajectory(saved, of(n), of(steps.ys.shape) if every else None)
+    shapes: Any = saved, of(n), of(steps.ys.shape) if every else None
+    return Trajectory(*shapes)
 
 
 def _jvp(primals, tangents):

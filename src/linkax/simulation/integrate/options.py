@@ -1,5 +1,7 @@
 """Checks of the options of a run, most of them diffrax's own objects, before anything is compiled."""
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -92,7 +94,12 @@ def check_saved_times(saveat, t0, t1, max_steps):
 
 def saves_times(saveat) -> bool:
     """Whether states are saved at given times, and nothing else."""
-    return jax.tree.structure(saveat) == jax.tree.structure(diffrax.SaveAt(ts=np.zeros(1)))
+    return jax.tree.structure(saveat) == jax.tree.structure(save_at(np.zeros(1)))
+
+
+def save_at(ts: Any) -> diffrax.SaveAt:
+    """Save states at times ts [s], an array of JAX or NumPy."""
+    return diffrax.SaveAt(ts=ts)
 
 
 def saved_times(saveat) -> list:

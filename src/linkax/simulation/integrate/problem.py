@@ -32,9 +32,9 @@ class Problem(eqx.Module):
     system: System
     method: AbstractFormulation
     accuracy: Accuracy
-    can_start: Bool[Array, ""] = True
-    closed_at: Float[Array, ""] = np.inf
-    from_singular: Bool[Array, ""] = False
+    can_start: Bool[Array, ""] | bool = True
+    closed_at: Float[Array, ""] | float = np.inf
+    from_singular: Bool[Array, ""] | bool = False
 
     def packed(self, q, v, sides=()):
         """The vector y of a state where the run begins."""

@@ -1,7 +1,7 @@
 """A diffrax solver that puts the state back on the closed loops after each step."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -116,7 +116,8 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         """The solver for one step: its root finder measures iterates as errors of the step are measured."""
         if self.tolerances is None:
             return self.solver
-        finder = self.solver.root_finder
+        inner: Any = self.solver
+        finder = inner.root_finder
         if type(finder) is diffrax.VeryChord:
             finder = Chord(0.0, 1.0, kappa=finder.kappa, linear_solver=finder.linear_solver)
         norm = StageNorm(problem, y0, duration, self.tolerances)
@@ -164,9 +165,10 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         if stages is None:
             passes, retry = arrives, jnp.ones_like(arrives)
         else:
+            inner_solver: Any = self.solver
             nearest = jnp.argmin(stages[1:])
             leaves, passes = stages[0], stages[1:][nearest]
-            retry = jnp.asarray(retry_factors(self.solver.tableau.c), passes.dtype)[nearest]
+            retry = jnp.asarray(retry_factors(inner_solver.tableau.c), passes.dtype)[nearest]
         closest = jnp.minimum(solver_state.closest, jnp.minimum(passes, arrives))
         switch = None
         if switching:

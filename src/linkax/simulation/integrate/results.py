@@ -6,7 +6,7 @@ import equinox as eqx
 from linkax.xla.enumerations import code
 
 
-class RESULTS(diffrax.RESULTS):
+class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  Equinox lets enumerations be extended
     """`diffrax.RESULTS`, and what can go wrong with a mechanism."""
 
     not_closed = (

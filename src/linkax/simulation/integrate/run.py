@@ -25,6 +25,7 @@ from linkax.simulation.integrate.options import (
     check_saved_times,
     check_steps,
     floating,
+    save_at,
     saves_times,
     traced_tolerances,
 )
@@ -80,7 +81,7 @@ class Run(eqx.Module):
     accuracy: Accuracy
     optimise: bool = eqx.field(static=True)
     saves_times: bool = eqx.field(static=True)
-    _options: DiffraxOptions | _Frozen
+    _options: DiffraxOptions | _Frozen | None
 
     @staticmethod
     def of(mechanism, state, *, t0, t1, accuracy, formulation, dtype, optimise, **given) -> "Run":
@@ -104,17 +105,17 @@ class Run(eqx.Module):
     @staticmethod
     def of_state(mechanism, state, t, formulation, accuracy) -> "Run":
         """What a state alone says of a run: nothing is stepped."""
-        return Run(mechanism, state, t, t, formulation, accuracy, True, False, DiffraxOptions(None, None, None, None))
+        return Run(mechanism, state, t, t, formulation, accuracy, True, False, None)
 
     @property
     def is_integrated(self) -> bool:
         """False for what a state alone says of a run."""
-        return self.options.solver is not None
+        return self._options is not None
 
     @property
     def options(self) -> DiffraxOptions:
         """diffrax's objects."""
-        options = self._options
+        options: Any = self._options
         return eqx.combine(options.arrays, options.rest) if isinstance(options, _Frozen) else options
 
     @property
@@ -162,7 +163,7 @@ class Run(eqx.Module):
 _DECIDE = ("solver", "saveat", "event", "max_steps")
 
 
-def checked_formulation(formulation, accuracy: Accuracy = None) -> AbstractFormulation:
+def checked_formulation(formulation, accuracy: Accuracy | None = None) -> AbstractFormulation:
     """A formulation from its name, or itself; None for the paper's."""
     if isinstance(formulation, str):
         formulation = named_formulation(formulation)
@@ -183,7 +184,7 @@ def _filled_in(mechanism, accuracy, t0, t1, *, solver, stepsize_controller, dt0,
     dt0 = check_steps(solver, stepsize_controller, dt0, max_steps, t0, t1)
     if saveat is None:
         evenly = np.linspace if all_concrete((t0, t1)) else jnp.linspace
-        saveat = diffrax.SaveAt(ts=evenly(t0, t1, DEFAULT_SAVES))
+        saveat = save_at(evenly(t0, t1, DEFAULT_SAVES))
     check_saved_times(saveat, t0, t1, max_steps)
     saveat, others["event"] = _with_functions(saveat, others["event"])
     # Tolerances are arrays, so that another value compiles nothing anew.

@@ -1,5 +1,7 @@
 """A diffrax step size controller for motion on a manifold with singular configurations and switches."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -54,9 +56,9 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         return (inner.rtol, inner.atol) if self.is_adaptive else otherwise
 
     @property
-    def innermost(self) -> diffrax.AbstractStepSizeController:
+    def innermost(self) -> Any:
         """The controller inside all wrappers."""
-        inner = self.controller
+        inner: Any = self.controller
         while hasattr(inner, "controller"):
             inner = inner.controller
         return inner
@@ -73,15 +75,17 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         return first, (state, jnp.zeros((), int))
 
     @in_one_kernel(when=lambda self, *_: self.is_undifferentiated, sound=lambda self, t0, *_: jnp.isfinite(t0))
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+    def adapt_step_size(self, t0: Any, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
         """Accept or reject the step, and choose the next one; `y_error` is a `StepError`."""
         scales = args.system.scales
-        magnitudes = tuple(_magnitudes(args, y) for y in (y0, y1_candidate))
+        magnitude, candidate = (_magnitudes(args, y) for y in (y0, y1_candidate))
         scaled = None
         if y_error.error is not None and self.is_adaptive:
             noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.distance_floor)
             # The second is none where the step has led to no numbers.
-            largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), *magnitudes)
+            largest = jax.tree.map(
+                lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), magnitude, candidate
+            )
             # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
             least = jnp.minimum(SEEN_ULPS * jnp.finfo(scales.dtype).eps, SEEN * self.innermost.rtol)
             scaled = tuple(
@@ -90,7 +94,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             )
         before, retries = controller_state
         keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
-            t0, t1, *magnitudes, args, scaled, error_order, before
+            t0, t1, magnitude, candidate, args, scaled, error_order, before
         )
         # A step size that is not a number does not proceed either.
         proceeds = next_t1 - next_t0 > SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t1), 1e-3)

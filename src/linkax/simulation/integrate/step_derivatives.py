@@ -6,7 +6,7 @@ steps itself needs seven copies.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -38,7 +38,7 @@ class Steps(NamedTuple):
 
     ts: Float[Array, " ends"]
     ys: Float[Array, "ends n"]
-    count: Int[Array, ""]
+    count: Int[Array, ""] | None
 
 
 class Trajectory(NamedTuple):
@@ -135,8 +135,9 @@ def _within(solver: ProjectedSolver, t0, t1, dense, t):
 
 def tangents_over_steps(solver, every, ivp, steps, tangents: InitialValueProblem) -> Trajectory:
     """JVP of a run, step by step from the first: tangents of its states; None among `tangents` is zero."""
-    saved, y0, last = ivp.saved, ivp.y0, steps.count - 1
-    saved_dot = None if saved is None else materialise(saved, tangents.saved)
+    y0, last = ivp.y0, steps.count - 1
+    saved: Any = ivp.saved
+    saved_dot: Any = None if saved is None else materialise(saved, tangents.saved)
 
     def step(sides, problem, t0, t1, y):
         return _step(solver, problem, t0, t1, y, sides)
@@ -178,7 +179,9 @@ def _reached(saved, j, t):
 def cotangents_over_steps(solver, ivp, steps, wanted, cotangent: Trajectory) -> InitialValueProblem:
     """VJP of a run, step by step from the last: cotangents of the leaves of `ivp` that are `wanted`."""
     problem, fixed = eqx.partition(ivp.problem, wanted.problem)
-    saved, last = ivp.saved, steps.count - 1
+    last = steps.count - 1
+    saved: Any = ivp.saved
+    saved_cotangent: Any = cotangent.saved
 
     of_problem = lambda problem: eqx.combine(problem, fixed)
 
@@ -193,7 +196,7 @@ def cotangents_over_steps(solver, ivp, steps, wanted, cotangent: Trajectory) -> 
             def save(carry):
                 j, *bars, saved_bar = carry
                 within = functools.partial(_within, solver)
-                *more, t_bar = jax.vjp(within, *ends, dense, saved[j])[1](cotangent.saved[j])
+                *more, t_bar = jax.vjp(within, *ends, dense, saved[j])[1](saved_cotangent[j])
                 bars = jax.tree.map(jnp.add, tuple(bars), tuple(more))
                 return j - 1, *bars, saved_bar.at[j].set(t_bar)
 
@@ -217,6 +220,7 @@ def cotangents_over_steps(solver, ivp, steps, wanted, cotangent: Trajectory) -> 
     count = 0 if saved is None else jnp.sum(saved <= finish)
     saved_bar = None if saved is None else jnp.zeros_like(saved)
     begin = last, count - 1, cotangent.end, jax.tree.map(jnp.zeros_like, problem), zero, zero, saved_bar
-    one = with_products_as_sums(one)
-    *_, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(lambda carry: carry[0] >= 0, one, begin)
+    *_, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(
+        lambda carry: carry[0] >= 0, with_products_as_sums(one), begin
+    )
     return eqx.filter(InitialValueProblem(problem_bar, y_bar, t0_bar, t1_bar, saved_bar), wanted)

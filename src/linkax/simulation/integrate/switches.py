@@ -14,7 +14,7 @@ from jax import lax
 
 from linkax.equations.configuration import configure
 from linkax.equations.motion import move
-from linkax.model.forces import has_switch
+from linkax.model.forces import AbstractForce, has_switch
 from linkax.xla.arrays import Array
 
 SAMPLES = 8  # of a step: between two of them a force element must not switch twice
@@ -27,7 +27,7 @@ ITERATIONS = 60
 class Held(eqx.Module):
     """A force element held on one side of its switch."""
 
-    force: eqx.Module
+    force: AbstractForce
     side: Array
 
     def applied(self, t, motion):

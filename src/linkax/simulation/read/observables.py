@@ -76,6 +76,12 @@ class Observables(NamedTuple):
     def motion(self):
         return move(self.configuration, self.v)
 
+    @property
+    def solved(self) -> Dynamics:
+        """`dynamics`, of an instance that has them."""
+        assert self.dynamics is not None
+        return self.dynamics
+
     def solve(self) -> Dynamics:
         return self.method.dynamics(self.system, self.t, self.q, self.v)
 
@@ -91,7 +97,7 @@ class Observables(NamedTuple):
     def acceleration(self, body, point):
         motion = self.motion
         arm, omega = _arm(motion.configuration, body, point), motion.angular_velocity[body]
-        angular, linear = body_accelerations(motion, self.dynamics.acceleration)
+        angular, linear = body_accelerations(motion, self.solved.acceleration)
         return linear[body] + cross(angular[body], arm) + cross(omega, cross(omega, arm))
 
     def center_of_mass(self, function, bodies):
@@ -108,7 +114,7 @@ class Observables(NamedTuple):
         moving = lambda t, q, v: jax.jvp(place, (t, q), (jnp.ones_like(t), rates(self.system.topology, q, v)))[1]
         if function is Observables.velocity:
             return moving(self.t, self.q, self.v)
-        changes = jnp.ones_like(self.t), rates(self.system.topology, self.q, self.v), self.dynamics.acceleration
+        changes = jnp.ones_like(self.t), rates(self.system.topology, self.q, self.v), self.solved.acceleration
         return jax.jvp(moving, (self.t, self.q, self.v), changes)[1]
 
     def poses(self):
@@ -128,10 +134,10 @@ class Observables(NamedTuple):
         return self.motion.joint_speeds(name)
 
     def _least_multipliers(self):
-        multipliers = self.dynamics.multipliers
+        multipliers = self.solved.multipliers
         if not self.system.topology.num_rows:
             return LeastMultipliers(multipliers, jnp.zeros((0, 0)))
-        tolerance = self.tangent_space.rank_tolerance
+        tolerance = self.tangent_space.tolerance
         rows, scales = jacobian(self.configuration), self.system.scales
         return least_multipliers(rows, multipliers, scales, tolerance, self.rank())
 
@@ -142,7 +148,7 @@ class Observables(NamedTuple):
         return self._least_multipliers().multipliers
 
     def reactions(self, on, axes):
-        found = reactions(self.motion, self.dynamics.acceleration, self._multipliers())
+        found = reactions(self.motion, self.solved.acceleration, self._multipliers())
         return seen_from(self.configuration, found, on, axes)
 
     def constraint_forces(self):
@@ -186,16 +192,16 @@ class Observables(NamedTuple):
         force = load.joint_force + along_speeds(configuration, load.force, load.moment)
         energy = lambda q: potential_energy(configure(self.system, self.t, q))
         _, rise = jax.jvp(energy, (self.q,), (rates(self.system.topology, self.q, self.v),))
-        return Power(force @ self.v + rise, self.dynamics.multipliers @ rate(self.system, self.t))
+        return Power(force @ self.v + rise, self.solved.multipliers @ rate(self.system, self.t))
 
     def violation_and_scales(self):
         """The violation, and the largest speed and acceleration of the joints [1/s, 1/s²]."""
         configuration = self.configuration
         position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
         velocity = jacobian(configuration) @ self.v - rate(self.system, self.t)
-        violation = Violation(*map(largest, (position, velocity, self.dynamics.violation)))
+        violation = Violation(*map(largest, (position, velocity, self.solved.violation)))
         speed = self.system.fastest(self.v)
-        return violation, speed, jnp.maximum(self.system.fastest(self.dynamics.acceleration), speed**2)
+        return violation, speed, jnp.maximum(self.system.fastest(self.solved.acceleration), speed**2)
 
     def rank(self):
         return jnp.sum(self.tangent_space.constraint_split(self.system, self.t, self.q).inverse.rank)

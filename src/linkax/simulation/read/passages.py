@@ -195,7 +195,8 @@ def _polished(solution, pair, time, q) -> _Found:
         if result_name(part.result) not in ENDED_WELL:
             break
         ts, qs, vs = (np.asarray(of)[:3] for of in (part.ts, part.q, part.v))
-        ends = [Samples(*(of[[0, k]][None] for of in (ts, qs, vs)), pair.distances[None]) for k in (1, 2)]
+        at_ends = lambda of, k: of[[0, k]][None]
+        ends = [Samples(at_ends(ts, k), at_ends(qs, k), at_ends(vs, k), pair.distances[None]) for k in (1, 2)]
         f, g = (_between(solution, end, np.ones(1))[0][0].smallest() for end in ends)
         share = -f / (g - f) if g != f else 0.5
         before, time, q = time, ts[1] + share * (ts[2] - ts[1]), qs[1] + share * (qs[2] - qs[1])
@@ -253,8 +254,9 @@ def _between(solution, pairs, places):
     for first in range(0, len(places), BATCH):
         taken = np.arange(first, min(first + BATCH, len(places)))
         filled = np.resize(taken, BATCH)  # one shape, so that one program serves
-        given = (*pairs.taken(filled)[:3], places[filled])
-        found = between_states(solution.mechanism, solution.run.tangent_space, solution.rank_nearby, *given)
+        ts, qs, vs, _ = pairs.taken(filled)
+        motion = solution.mechanism, solution.run.tangent_space, solution.rank_nearby
+        found = between_states(*motion, ts, qs, vs, places[filled])
         change, projector, distance, q = (np.asarray(part)[: len(taken)] for part in found)
         changes += map(_Change, change, projector)
         distances, states = [*distances, distance], [*states, q]

@@ -65,7 +65,7 @@ class Solution(eqx.Module):
     t_end: Float[Array, "*batch"]
     end: State
     stats: dict[str, Any]
-    result: RESULTS
+    result: Any
     rank_nearby: Int[Array, "*batch k"] | None
     closest: Float[Array, "*batch"]
     average: Float[Array, "*batch"]
@@ -120,7 +120,7 @@ class Solution(eqx.Module):
         state = checked_state(mechanism, state)
         check_accuracy(accuracy)
         t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
-        result = RESULTS.successful
+        result: Any = RESULTS.successful
         if not concrete(sound := sound_numbers(mechanism)):
             result = RESULTS.where(sound, result, RESULTS.not_finite)
         return Solution(
@@ -267,7 +267,7 @@ class Solution(eqx.Module):
         """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
         return _over_times(Observables.distance, self)
 
-    def error_estimate(self, reading: "Callable[[Solution], Any] | None" = None, *, factor: float = 1e-2):
+    def error_estimate(self, reading: "Callable[[Solution], Any] | None" = None, *, factor: Any = 1e-2):
         """How far this run is off, found by a second one that is more accurate.
 
         The second run is in double precision, at tolerances `factor` times those of this one but not below 1e-13,
@@ -323,11 +323,11 @@ class Solution(eqx.Module):
         return isinstance(name, str) and name in self.mechanism.topology.constraints
 
     def _of_constraint(self, function, name):
-        """Of all constraints, so that all names share a program, that of one."""
+        """Force of one constraint; computed for all, so that names share one program."""
         return _in_motion(function, self)[..., self.mechanism.topology.constraints.index(name)]
 
     def _of_joint(self, function, name, on, axes):
-        """Of reactions of all joints, so that all names share a program, those of one."""
+        """Reaction of one joint; computed for all, so that names share one program."""
         for what, entry, choices in (("on", on, get_args(Side)), ("axes", axes, get_args(Axes))):
             one_of(entry, choices, what)
         self.mechanism.joint(name)
@@ -336,24 +336,24 @@ class Solution(eqx.Module):
         return Reaction(force[..., index, :], moment[..., index, :])
 
     def _body(self, name):
-        if isinstance(self.mechanism.body(name), Beam):
-            some = ", ".join(map(repr, self.mechanism.body(name).sections[:3]))
+        body = self.mechanism.body(name)
+        if isinstance(body, Beam):
+            some = ", ".join(map(repr, body.sections[:3]))
             raise ValueError(f"{name!r} is a beam and bends; ask for one of its sections, {some}, ...")
         return self._index(name)
 
     def _index(self, section):
-        """Of a rigid body, for each member of a batch: a number that is traced, so that all names share a program."""
+        """Index of a body, for each member of a batch: traced, so that names share one program."""
         return np.full(self.ts.shape[:-1], self.mechanism.topology.bodies.index(section))
 
     def _of_point(self, function, body, at):
-        """A function of an `Instant` for a point of a rigid body or of a beam."""
+        """Read a function of `Observables` for a point of a rigid body or of a beam."""
         found = self.mechanism.body(body)
         read = _in_motion if function is Observables.acceleration else _over_times
-        if isinstance(found, Beam) and at is None:
-            return read(
-                Observables.center_of_mass, self, function, np.stack([*map(self._index, found.sections)], axis=-1)
-            )
-        if at is None:
+        if at is None and isinstance(found, Beam):
+            sections = np.stack([*map(self._index, found.sections)], axis=-1)
+            return read(Observables.center_of_mass, self, function, sections)
+        if at is None and not isinstance(found, Beam):
             return read(function, self, self._index(body), found.center_of_mass)
         if isinstance(at, str):
             frame = found.at(at)

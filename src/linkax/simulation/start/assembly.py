@@ -173,7 +173,7 @@ class _Remainder(eqx.Module):
 def _assemble(mechanism, positions, speeds, guess, t):
     system = system_of(mechanism, jnp.result_type(float))
     topology = system.topology
-    q = neutral(topology, system.dtype)
+    q = jnp.asarray(neutral(topology, system.dtype))
     for given in (guess, positions):
         for along, entry in zip(given.terms, given.values, strict=True):
             if along.joint in topology.coordinates:

@@ -85,7 +85,7 @@ def check_initial_state(method: TangentSpace, system: System, t, state: State) -
     direction = jnp.where(at_rest, acceleration, v)
     off, rank = crossing.along(direction, at_rest)
     # Rows that are not quite dependent contradict each other by as much.
-    on_branch = largest(off) <= ON_BRANCH * method.rank_tolerance
+    on_branch = largest(off) <= ON_BRANCH * method.tolerance
     return InitialCheck(
         t=begins,
         state=start,

@@ -13,7 +13,7 @@ from linkax.xla.static_scatter import scatter_static
 
 def rank_tolerance(dtype):
     """τ of everything that is assembled."""
-    return TangentSpace().prepared(dtype).rank_tolerance
+    return TangentSpace().prepared(dtype).tolerance
 
 
 def beams_of(system):

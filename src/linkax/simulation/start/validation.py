@@ -42,7 +42,7 @@ def _is_law(node) -> bool:
 
 def check_mechanism(mechanism):
     """Check that this is one mechanism, that its functions are unchanged, and that JAX is in double precision."""
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         raise ValueError(
             "jax_enable_x64 is False, switched off after linkax was imported; switch it on again by "
             'jax.config.update("jax_enable_x64", True), and for a run in single precision give dtype=jnp.float32'
