@@ -125,6 +125,6 @@ def test_a_folder_that_cannot_be_written_is_named_before_the_run(command, case, 
     if str(out).startswith("/proc") and not Path("/proc/self").exists():
         pytest.skip("no /proc")
     never = lambda *arguments: pytest.fail("assembled before the folder was tried")
-    monkeypatch.setattr("linkax.cli.options.Run.initial", never)
+    monkeypatch.setattr("linkax.cli.options.RunOptions.initial", never)
     refused([command, "pendulum", f"--out={out}"], capsys, folder, "--out")
     assert (folder / "there").read_text() == "kept"

@@ -71,7 +71,7 @@ def _simulate(arguments):
     print(json.dumps(found, allow_nan=False) if arguments.json else _for_people(found, files))
     if found["result"] == "successful":
         return 0
-    stopped = f"the run stopped at t = {found['t_end']:.6g} s: {found['message']}{cause(run.solution, state)}"
+    stopped = f"the run stopped at t = {found['t_end']:.6g} s: {found['message']}{cause(run.solution)}"
     print(f"linkax: {stopped}", file=sys.stderr)
     return 1
 

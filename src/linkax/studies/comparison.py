@@ -167,7 +167,7 @@ def compare(
             run(formulation, stepping, INSTANT * times)  # compiles, where no formulation before it has
             solution, seconds = _timed(functools.partial(run, formulation, stepping), repeats)
             apart = np.where(np.isfinite(solution.ts), _apart(positions(_plain(solution)), answer), 0.0)
-            trial = _trial(name, stepping, solution, seconds, apart, bound, reference, passages, state)
+            trial = _trial(name, stepping, solution, seconds, apart, bound, reference, passages)
             found = found._replace(trials=[*found.trials, trial])
         keep(found)
     return found
@@ -220,7 +220,7 @@ def _apart(positions, answer):
     return np.where(np.isfinite(largest), largest, np.inf)
 
 
-def _trial(name, stepping, found, seconds, apart, bound, reference, passages, state) -> Trial:
+def _trial(name, stepping, found, seconds, apart, bound, reference, passages) -> Trial:
     finished = bool(found.result == RESULTS.successful)
     reached = np.isfinite(np.asarray(found.ts))
     energy = np.asarray(_plain(found).energy() - reference.energy())[reached]
@@ -231,7 +231,7 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages, st
     if not finished:
         diverged_at = float(found.t_end)
         why = f"stopped at {diverged_at:.4g} s: {STOPPED.get(result_name(found.result), 'failed')}."
-        why += cause(found, state)
+        why += cause(found)
     elif verdict == "diverged":
         first = int(np.argmax(apart > bound))
         gap = float(found.violation().position[first])
