@@ -20,9 +20,9 @@ from linkax.analysis.equilibrium import StabilityWarning as StabilityWarning  # 
 from linkax.analysis.equilibrium import equilibrium as equilibrium  # noqa: E402
 from linkax.analysis.inverse_dynamics import InverseDynamics as InverseDynamics  # noqa: E402
 from linkax.analysis.inverse_dynamics import inverse_dynamics as inverse_dynamics  # noqa: E402
+from linkax.analysis.linearisation import Linearisation as Linearisation  # noqa: E402
 from linkax.analysis.mobility import Mobility as Mobility  # noqa: E402
 from linkax.analysis.mobility import mobility as mobility  # noqa: E402
-from linkax.analysis.vibration import Linearisation as Linearisation  # noqa: E402
 from linkax.analysis.vibration import linearise as linearise  # noqa: E402
 from linkax.equations.motion import Motion as Motion  # noqa: E402
 from linkax.equations.reactions import Reaction as Reaction  # noqa: E402

@@ -1,0 +1,85 @@
+"""Small motions about a state: their matrices, eigenvalues and modes."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from linkax.xla.batches import one_by_one
+
+GROWS = 1e-6  # |Re λ| / |λ| up to which a motion neither grows nor decays
+
+_eig = one_by_one(lambda matrix: tuple(jnp.linalg.eig(matrix)))
+
+
+@jax.custom_jvp
+def _spectrum(matrix):
+    """Eigenvalues and eigenvectors of a matrix, differentiable to any order where no two eigenvalues are equal."""
+    return _eig(matrix)
+
+
+@_spectrum.defjvp
+def _spectrum_jvp(primals, changes):
+    values, vectors = _spectrum(*primals)
+    rotated = jnp.linalg.solve(vectors, changes[0].astype(vectors.dtype) @ vectors)
+    apart = values[None, :] - values[:, None] + jnp.eye(len(values), dtype=values.dtype)
+    mixed = jnp.where(jnp.eye(len(values), dtype=bool), 0.0, rotated / apart)
+    return (values, vectors), (jnp.diagonal(rotated), vectors @ mixed)
+
+
+class Linearisation(NamedTuple):
+    """Small motions about a state, v = T ẏ on the tangent space: ÿ + D ẏ + K y = 0.
+
+    With d degrees of freedom:
+
+    - `natural_frequencies`: undamped, (d,) [rad/s], in rising order. A negative entry −r is no frequency: that mode
+      grows as exp(r t), r in [1/s].
+    - `modes`: speeds of the tree's joints in each mode, (n_v, d), scaled to vᵀ M v = 1. NaN where gyroscopic terms
+      leave no modes in which all joints move in phase; see `eigenvectors` then.
+    - `basis`: T, (n_v, d), with Tᵀ M T = 1. `stiffness`: K, (d, d) [1/s²]. `damping`: D, (d, d) [1/s].
+
+    About a steady motion, y are changes of the joints' coordinates that move with it, and frequencies are those seen
+    from the rotating bodies: a rotor that whirls at ω seen from the ground whirls at ω − Ω here. Centrifugal forces,
+    and what they stiffen, are in K, gyroscopic terms in D, as its skew part. `natural_frequencies` leave out the
+    symmetric part of D, and the skew part of K, which dampers have that do not rotate with the bodies.
+
+    Differentiable where no two frequencies are equal.
+    """
+
+    natural_frequencies: Float[Array, " d"]
+    modes: Float[Array, "n_v d"]
+    basis: Float[Array, "n_v d"]
+    stiffness: Float[Array, "d d"]
+    damping: Float[Array, "d d"]
+
+    @property
+    def eigenvalues(self) -> Complex[Array, "*batch n"]:
+        """λ of the motions exp(λ t), with damping and gyroscopic terms, (2 d,) [1/s]. A motion grows where Re λ > 0."""
+        return _of_members(self.stiffness, self.damping)[0]
+
+    @property
+    def eigenvectors(self) -> Complex[Array, "*batch n_v n"]:
+        """Speeds of the tree's joints in the motion of each of `eigenvalues`, (n_v, 2 d), scaled arbitrarily."""
+        count = self.stiffness.shape[-1]
+        return self.basis @ _of_members(self.stiffness, self.damping)[1][..., count:, :]
+
+
+def state_matrix(stiffness: Float[Array, "d d"], damping: Float[Array, "d d"]) -> Float[Array, "2*d 2*d"]:
+    """A in d/dt (y, ẏ) = A (y, ẏ)."""
+    nothing = jnp.zeros_like(stiffness)
+    return jnp.block([[nothing, nothing + jnp.eye(len(nothing))], [-stiffness, -damping]])
+
+
+@jax.jit
+def _of_members(stiffness, damping):
+    """Eigenvalues and eigenvectors of the state matrix of each member of a batch."""
+    of_one = lambda stiffness, damping: _spectrum(state_matrix(stiffness, damping))
+    return jnp.vectorize(of_one, signature="(n,n),(n,n)->(m),(m,m)")(stiffness, damping)
+
+
+def gyroscopic_frequencies(matrix: Float[Array, "n n"]) -> Float[Array, " n//2"]:
+    """Natural frequencies, as in `Linearisation`, of a state matrix whose eigenvalues are pairs of opposite sign."""
+    values, _ = _spectrum(matrix)
+    size = jnp.sqrt(values.real**2 + values.imag**2)
+    return jnp.sort(jnp.where(jnp.abs(values.real) <= GROWS * size, jnp.abs(values.imag), -jnp.abs(values.real)))[::2]
