@@ -1,1 +1,1 @@
-"""A mechanism at one state: mobility, forces that move it, equilibrium, small vibrations."""
+"""Analyse a mechanism at one state: its mobility, inverse dynamics, equilibrium and small vibrations."""

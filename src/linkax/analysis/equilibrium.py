@@ -1,4 +1,4 @@
-"""Equilibrium, at rest or in steady motion: a search downhill on the tangent space of the loops."""
+"""Find an equilibrium, at rest or in steady motion, by a search downhill on the tangent space of the loops."""
 
 import dataclasses
 import warnings
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from linkax.analysis.steady import (
     AGREES,
@@ -38,32 +38,32 @@ from linkax.xla.derivatives import pushforward
 from linkax.xla.tracing import all_concrete, evaluate_now, quick_compile
 
 MOST_STEPS = 200
-AT_REST = 1e-12  # step [rad, lengths of the mechanism] below which the search for an equilibrium ends
-BALANCED_STEP = 1e-8  # the same, above which it has failed
-OVERSHOOT = 0.5  # of the work on a step, which forces may do against it at its end
-NEUTRAL = 1e-12  # stiffness relative to the largest that counts as none
+SMALLEST_STEP = 1e-12  # at which the search ends [rad, lengths of the mechanism]
+BALANCED_STEP = 1e-8  # last step above which the search has failed [rad, lengths of the mechanism]
+OVERSHOOT = 0.5  # work of the forces at the end of a step, against it, relative to their work at its start
+NEUTRAL = 1e-12  # stiffness, relative to the largest, up to which it counts as zero
 ASIDE = 1e-3  # first step out of an unstable equilibrium [rad, lengths of the mechanism]; each next one doubles it
 
 _pseudo_inverse = one_by_one(lambda matrix: jnp.linalg.pinv(matrix, rtol=NEUTRAL))
 
-# Equilibria need no mass, and forces differ less between soft and stiff directions than accelerations do.
+# An equilibrium needs no mass, and forces differ less between soft and stiff directions than accelerations do.
 _STATICS = TangentSpace(metric="identity")
 
 
 class EquilibriumError(RuntimeError):
     """No equilibrium was found; `state` is where the search stopped."""
 
-    def __init__(self, message, state=None):  # the message alone is what pickle gives, the rest follows
+    def __init__(self, message: str, state: State | None = None):  # pickle calls it with the message alone
         super().__init__(message)
         self.state = state
 
 
 class StabilityWarning(UserWarning):
-    """An equilibrium that may be unstable: forces without a potential do not tell."""
+    """An equilibrium may be unstable, which forces without a potential do not show."""
 
 
 class _Balanced(Nearby):
-    """Forces, and no masses but for their centrifugal forces. The metric is that of radians and lengths."""
+    """A mechanism near an equilibrium: its forces, centrifugal ones included, on a T orthonormal in the scales."""
 
     @staticmethod
     def of(system, method, t, q) -> "_Balanced":
@@ -71,22 +71,22 @@ class _Balanced(Nearby):
         return _Balanced(system, method, t, q, basis, basis.T / system.scales**2)
 
     def motion(self, y):
-        """How the mechanism moves at y: as drives ask, and else as little as the loops allow. And its loops there."""
-        rest = jnp.zeros_like(self.system.scales)
-        q, v, *_ = self.method.correct(self.system, self.t, self.at(y), rest)
+        """The motion at y, v as drives ask and else as small as the loops allow, and the constraints there."""
+        zero = jnp.zeros_like(self.system.scales)
+        q, v, *_ = self.method.correct(self.system, self.t, self.at(y), zero)
         crossing = self.method.constraint_split(self.system, self.t, q)
-        return move(crossing.configuration, v if is_driven(self.system) else rest), crossing
+        return move(crossing.configuration, v if is_driven(self.system) else zero), crossing
 
     def force(self, y):
-        """What the forces do along y, less what the loops take."""
+        """Forces along y, less the reactions of the loops."""
         motion, crossing = self.motion(y)
         forces, none = generalised_force(motion), jnp.zeros(len(crossing.jacobian), y.dtype)
         metric = jnp.diag(self.system.scales**-2)
         left, _ = constrained_solve(crossing.inverse, metric, crossing.jacobian, forces, none)
         return self.dual @ left
 
-    def at_rest(self):
-        """The force at y = 0, and the stiffness, minus its derivative."""
+    def force_and_stiffness(self):
+        """The force f at y = 0, and the stiffness −∂f/∂y."""
         force, slopes = self.slopes(self.force, jnp.zeros_like(self.system.scales))
         return force, -slopes
 
@@ -94,11 +94,11 @@ class _Balanced(Nearby):
 class _Ending(NamedTuple):
     """How a search ended.
 
-    - `longest`: part of the last step. `gap`: of the loops.
-    - `unstable`: whether a direction leads further down; `circulatory`: whether that may be so and stiffness has
-      a part without a potential, as large as what is unstable.
-    - `missed`: rates that drives ask for and the state has not, one for each constraint. `changes`: how forces and
-      loops differ from an equilibrium later on.
+    - `longest`: largest part of the last step, and `gap`: of the loops [rad, lengths of the mechanism].
+    - `unstable`: whether the potential falls further in some direction.
+    - `circulatory`: whether the equilibrium may be unstable, and stiffness without a potential hides it.
+    - `missed`: by how much speeds miss the rate that each drive asks for, (k,), one entry for each constraint.
+    - `changes`: relative forces and gaps of the loops that appear as the motion goes on.
     """
 
     longest: Float[Array, ""]
@@ -110,34 +110,39 @@ class _Ending(NamedTuple):
 
     @property
     def is_sound(self):
-        """Whether an equilibrium is found."""
+        """Whether the search ended in an equilibrium."""
         steady = (jnp.max(self.missed, initial=0.0) <= AGREES) & (self.changes <= AGREES)
         return (self.longest <= BALANCED_STEP) & (self.gap <= CLOSED) & jnp.logical_not(self.unstable) & steady
 
 
-def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
-    """A stable equilibrium near a given state: all forces in balance, and nothing moves but what is driven.
+def equilibrium(mechanism: Mechanism, state: State, *, t: ArrayLike = 0.0) -> State:
+    """Find a stable equilibrium near a state: all forces balance, and no joint moves but those that drives move.
 
-    Where the speeds of the state are zero it is one at rest, and drives hold their joints where they are at time t [s].
-    Else drives go on, at rates that the state must have, such as a rotation at a constant rate: the equilibrium
-    is that of a steady motion, in which nothing else moves, with its centrifugal forces. Speeds of the state
-    that nothing drives do not matter.
+    Where all speeds of the state are zero, drives hold their joints in their positions at time t [s]. Else drives go
+    on, at rates that the state must have, such as a rotation at constant speed: the result is a steady motion, in which
+    centrifugal forces act and no other joint moves. Speeds of joints without drive are ignored.
 
-    The search goes downhill, and on from equilibria that are unstable, to a least (effective) potential. Forces
-    without a potential may make an equilibrium unstable unseen; where they may, a `StabilityWarning` says so, and the
-    eigenvalues of `linkax.linearise` tell.
+    The search minimises the (effective) potential, and leaves unstable equilibria. Forces without a potential can make
+    an equilibrium unstable without the search noticing: a `StabilityWarning` says where they may, and the eigenvalues
+    of `linkax.linearise` decide.
 
-    Differentiable with respect to the numbers of the mechanism, to any order, and not to the state where it begins.
+    Differentiable to any order with respect to the mechanism's numbers, and not with respect to the initial state.
 
-    **Raises:** `EquilibriumError` where the search does not come to rest, cannot close the loops or leave an
-    unstable equilibrium, or where what is driven does not move steadily; inside JAX transformations nothing
-    is raised, and coordinates are not finite then.
+    **Arguments:** `mechanism`, `state`: see `linkax.simulate`; the search begins at the state. `t`: time [s].
+
+    **Returns:** the `State` in equilibrium.
+
+    **Raises:** `EquilibriumError` where the search does not converge, cannot close the loops or leave an unstable
+    equilibrium, or where driven joints do not move steadily. Inside JAX transformations nothing is raised, and
+    coordinates are NaN.
+
+    **Warns:** `StabilityWarning`.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
     moves = may_move(state) and any(constraint.is_driven for constraint in mechanism.constraints)
     found, ending = _equilibrium(mechanism, state, t, moves)
     if not moves:
-        # Known inside of transformations too, so that what reads the state need not reckon with motion.
+        # Concrete inside transformations too: whoever reads the state sees that nothing moves.
         found = State(found.q, evaluate_now(jnp.zeros, found.v.shape, found.v.dtype))
     if not all_concrete((found, ending)):
         return State(marked(mechanism, jnp.where(ending.is_sound, found.q, jnp.nan)), found.v)
@@ -164,7 +169,7 @@ def equilibrium(mechanism: Mechanism, state: State, *, t=0.0) -> State:
 
 
 def _check_steady(mechanism, ending, found, t):
-    """Raise where drives do not move steadily."""
+    """Raise an EquilibriumError where drives do not move steadily."""
     still = "give a state with speeds of zero, for the equilibrium where drives hold"
     missed = np.asarray(ending.missed)
     misses = np.logical_not(missed <= AGREES)
@@ -182,8 +187,9 @@ def _check_steady(mechanism, ending, found, t):
 
 @quick_compile
 def _equilibrium(mechanism, state, t, moves):
+    """The state in which the search ends, and its `_Ending`."""
     system = system_in(mechanism, state, t, moves)
-    q, search = _at_rest(system, t, lax.stop_gradient(state.q))
+    q, search = _search(system, t, lax.stop_gradient(state.q))
     v, method = jnp.zeros(system.topology.num_speeds, system.dtype), _STATICS.prepared(system.dtype)
     missed, changes = jnp.zeros(len(system.constraints), system.dtype), jnp.zeros((), system.dtype)
     gap = jnp.where(jnp.all(jnp.isfinite(state.v)), widest_gap(system, t, q), jnp.inf)
@@ -200,12 +206,12 @@ def _equilibrium(mechanism, state, t, moves):
 
 
 def _changes(system, method, t, q, v):
-    """How far a motion on at speeds v leads from balance and from closed loops, relative to all forces."""
+    """The largest force, relative to all forces, and gap of the loops as the motion goes on at speeds v."""
 
     def at(instant):
         later = _Balanced.of(system, method, instant.t, retract(system.topology, q, instant.motion))
-        rest = jnp.zeros_like(v)
-        scale, left = largest_force(later.motion(rest)[0]), jnp.max(jnp.abs(later.force(rest)), initial=0.0)
+        zero = jnp.zeros_like(v)
+        scale, left = largest_force(later.motion(zero)[0]), jnp.max(jnp.abs(later.force(zero)), initial=0.0)
         gap = widest_gap(system, instant.t, later.q)
         return jnp.maximum(jnp.where(left > 0.0, left / jnp.where(scale > 0.0, scale, 1.0), 0.0), gap)
 
@@ -213,13 +219,16 @@ def _changes(system, method, t, q, v):
 
 
 class _Search(NamedTuple):
-    """Where a search for an equilibrium is, the step to try from there, its longest part and the forces' work on it.
+    """A search for an equilibrium.
 
-    `lowest`: stiffness of all directions, zero where none is unstable; `circulation`: the largest part of the stiffness
-    without a potential.
+    - `steps`: number of steps tried.
+    - `q`: coordinates reached. `step`: change of them to try next, (n_v,); `longest`: its largest part [rad, lengths of
+      the mechanism]; `work`: of the forces on it [J].
+    - `lowest`: smallest stiffness in any direction, zero where none is negative.
+    - `circulation`: largest entry of the skew part of the stiffness, which has no potential.
     """
 
-    count: Int[Array, ""]
+    steps: Int[Array, ""]
     q: Float[Array, " n_q"]
     step: Float[Array, " n_v"]
     longest: Float[Array, ""]
@@ -229,23 +238,23 @@ class _Search(NamedTuple):
 
 
 @eqx.filter_custom_jvp
-def _at_rest(system, t, q):
-    """Coordinates of an equilibrium, by a search from q; and how it ended."""
-    method, rest = _STATICS.prepared(system.dtype), jnp.zeros(system.topology.num_speeds, system.dtype)
+def _search(system, t, q):
+    """Coordinates of an equilibrium, and the last `_Search`, from coordinates q."""
+    method, zero = _STATICS.prepared(system.dtype), jnp.zeros(system.topology.num_speeds, system.dtype)
     size = system.fastest
 
     def unfinished(search):
-        return (search.count < MOST_STEPS) & (search.longest > AT_REST)
+        return (search.steps < MOST_STEPS) & (search.longest > SMALLEST_STEP)
 
     def advance(search):
-        """Try a step; where it goes beyond the lowest potential, half of it next, or else a new one from there.
+        """Try a step. If it goes beyond the minimum of the potential, halve it, else choose the next one from there.
 
-        A step is by the stiffness, all of whose directions count as stable. Where that leads no further, it is one
-        out of an unstable equilibrium, if it is one.
+        A step is f / |k| along each eigenvector of the stiffness. At an equilibrium that is unstable it is one along
+        the least stable direction.
         """
-        q, _ = method.close(system, t, retract(system.topology, search.q, search.step), rest)
+        q, _ = method.close(system, t, retract(system.topology, search.q, search.step), zero)
         here = _Balanced.of(system, method, t, q)
-        force, stiffness = here.at_rest()
+        force, stiffness = here.force_and_stiffness()
         values, vectors = eigh((stiffness + stiffness.T) / 2.0)
         stiff = jnp.abs(values) > NEUTRAL * jnp.max(jnp.abs(values))
         along = vectors.T @ force
@@ -255,36 +264,36 @@ def _at_rest(system, t, q):
         lowest = jnp.where(stiff[0], jnp.minimum(values[0], 0.0), 0.0)
         circulation = jnp.max(jnp.abs(stiffness - stiffness.T)) / 2.0
         aside = here.basis @ vectors[:, 0]
-        # The sign of an eigenvector is chance.
+        # The sign of an eigenvector is arbitrary: let its largest part be positive.
         aside = aside * jnp.sign(aside[jnp.argmax(jnp.abs(aside / system.scales))])
-        leave = (size(step) <= AT_REST) & (lowest < 0.0) & (circulation <= -lowest)
+        leave = (size(step) <= SMALLEST_STEP) & (lowest < 0.0) & (circulation <= -lowest)
         step, work = jnp.where(leave, ASIDE * aside / size(aside), shorter * step), shorter * (downhill @ force)
-        onwards = _Search(search.count + 1, q, step, size(step), jnp.where(leave, 0.0, work), lowest, circulation)
+        onwards = _Search(search.steps + 1, q, step, size(step), jnp.where(leave, 0.0, work), lowest, circulation)
         half = search._replace(
-            count=search.count + 1, step=search.step / 2.0, longest=search.longest / 2.0, work=search.work / 2.0
+            steps=search.steps + 1, step=search.step / 2.0, longest=search.longest / 2.0, work=search.work / 2.0
         )
         beyond = (here.dual @ search.step) @ force < -OVERSHOOT * search.work
         return jax.tree.map(lambda a, b: jnp.where(beyond, a, b), half, onwards)
 
     nothing = jnp.zeros((), system.dtype)
-    begin = _Search(jnp.zeros((), int), q, rest, nothing + jnp.inf, *3 * (nothing,))
-    found = lax.while_loop(unfinished, advance, begin)
-    return found.q, found
+    begin = _Search(jnp.zeros((), int), q, zero, nothing + jnp.inf, *3 * (nothing,))
+    search = lax.while_loop(unfinished, advance, begin)
+    return search.q, search
 
 
-@_at_rest.def_jvp
-def _at_rest_jvp(primals, changes):
-    """Where the forces stay in balance, to any order: the search has no derivative."""
+@_search.def_jvp
+def _search_jvp(primals, changes):
+    """Derivatives, to any order, of the coordinates at which the forces balance; those of the search do not matter."""
     (system, t, begin), (system_change, t_change, _) = primals, changes
-    q, search = _at_rest(system, t, begin)
+    q, search = _search(system, t, begin)
     here = _Balanced.of(system, _STATICS.prepared(system.dtype), t, q)
-    rest = jnp.zeros(system.topology.num_speeds, system.dtype)
-    force = lambda system, t: dataclasses.replace(here, system=system, t=t).force(rest)
+    zero = jnp.zeros(system.topology.num_speeds, system.dtype)
+    force = lambda system, t: dataclasses.replace(here, system=system, t=t).force(zero)
     _, unbalanced = pushforward(force, (system, t), (system_change, t_change))
-    change = _pseudo_inverse(here.at_rest()[1]) @ unbalanced
+    change = _pseudo_inverse(here.force_and_stiffness()[1]) @ unbalanced
 
     def moved(system, t, y):
-        return here.method.close(system, t, retract(system.topology, q, here.basis @ y), rest)[0]
+        return here.method.close(system, t, retract(system.topology, q, here.basis @ y), zero)[0]
 
-    _, q_change = pushforward(moved, (system, t, rest), (system_change, t_change, change))
+    _, q_change = pushforward(moved, (system, t, zero), (system_change, t_change, change))
     return (q, search), (q_change, jax.tree.map(lambda _: None, search))

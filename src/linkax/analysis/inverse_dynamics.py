@@ -1,11 +1,12 @@
-"""Forces along joints that give prescribed accelerations."""
+"""Find the forces along joints that produce prescribed accelerations."""
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import rates
@@ -22,28 +23,41 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import by_joint, checked_state, checked_time, marked
 from linkax.xla.tracing import concrete, quick_compile
 
-MET = 1e-9  # relative to the largest acceleration
+JointKey = str | tuple[str, int]
+Accelerations = Mapping[JointKey, ArrayLike | Sequence[float]]
+MET = 1e-9  # error up to which an acceleration counts as reached, relative to the largest
 
 
 class InverseDynamics(NamedTuple):
-    """What drives a prescribed motion.
+    """Forces along joints, and the accelerations that they produce.
 
-    - `forces`: {joint, as it was given: along its speeds [N m or N], on the child, (n,)}.
-    - `acceleration`: v̇ of the tree's joints, (n_v,).
+    - `forces`: {key of `accelerations`: forces on the child along the joint's speeds, (n,) [N m or N]}.
+    - `acceleration`: v̇ of the tree's joints, (n_v,) [rad/s² or m/s²].
     """
 
-    forces: dict
+    forces: dict[JointKey, Float[Array, " n"]]
     acceleration: Float[Array, " n_v"]
 
 
-def inverse_dynamics(mechanism: Mechanism, state: State, accelerations, *, t=0.0) -> InverseDynamics:
-    """The forces along joints that give them prescribed accelerations, at a state on the closed loops.
+def inverse_dynamics(
+    mechanism: Mechanism,
+    state: State,
+    accelerations: Mapping[JointKey, ArrayLike | Sequence[float]],
+    *,
+    t: ArrayLike = 0.0,
+) -> InverseDynamics:
+    """Find the forces along joints that produce prescribed accelerations, at a state on the closed loops.
 
-    What is not prescribed moves as the forces drive it. The mechanism's own forces act besides.
-    Where several sets of forces do the same, these have the smallest norm.
+    The mechanism's own forces act too, and joints without a prescribed acceleration move as all forces drive them.
+    Where several sets of forces produce the same motion, the one of smallest norm is returned.
 
-    **Arguments:** `accelerations`: {joint, in the tree or cut: rates of its speeds [rad/s² or m/s²]};
-    (joint, index) for one of several.
+    **Arguments:**
+
+    - `mechanism`, `state`: see `linkax.simulate`. `t`: time [s].
+    - `accelerations`: {joint: rates of its speeds [rad/s² or m/s²]}, of joints in the tree or cut; with
+      (joint, index) as the key, the rate of one of its speeds.
+
+    **Returns:** an `InverseDynamics`.
 
     **Raises:** `ValueError` where the loops do not allow the accelerations together, naming the joint.
     """

@@ -1,9 +1,9 @@
-"""How a mechanism can move at a state, and which of its constraints are redundant."""
+"""Count the degrees of freedom of a mechanism at a state, and name its redundant constraints."""
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from linkax.equations.system import system_of
 from linkax.formulations.constraint_split import ConstraintSplit
@@ -20,7 +20,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.xla.tracing import quick_compile
 
-INVOLVED = 1e-6  # least part of a row in a self-stress of magnitude one
+INVOLVED = 1e-6  # entry of a self-stress of magnitude one up to which its row counts as not part of it
 # Table 1 of the paper: which axes of parent and child each rotation row keeps orthogonal.
 ROTATIONS = {(1, 2): "α₁", (2, 1): "α₁", (0, 2): "α₂", (0, 1): "α₃"}
 TRANSLATIONS = ("s₁", "s₂", "s₃")
@@ -29,13 +29,13 @@ TRANSLATIONS = ("s₁", "s₂", "s₃")
 class Mobility(eqx.Module):
     """How a mechanism can move at a state.
 
-    - `rank`: number of independent constraints. `degrees_of_freedom`: of the speeds there; one more
-      for each constraint that is lost in a singular configuration.
-    - `num_redundant`: constraints that depend on others, those that no motion changes included.
-    - `distance`: from the nearest singular configuration, see `linkax.Accuracy`. Exactly in one the
-      smaller `rank` tells, and not this. NaN where a number that JAX traces is outside of what it can be.
-    - `dispensable`: of each constraint row, in the order of `rows`, whether it could be left out
-      without freeing anything.
+    - `rank`: number of independent constraint rows.
+    - `degrees_of_freedom`: n_v − rank; each row that a singular configuration makes dependent adds one.
+    - `num_redundant`: number of rows that depend on others, including rows that no motion changes.
+    - `distance`: from the nearest singular configuration, see `linkax.Accuracy`. Exactly in one, the smaller `rank`
+      shows it, and not this number. NaN where a number that JAX traces is not one that it can be.
+    - `dispensable`: whether each constraint row, in the order of `rows`, could be left out without freeing a motion,
+      (m,).
     """
 
     rank: Int[Array, ""]
@@ -47,21 +47,21 @@ class Mobility(eqx.Module):
 
     @property
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """(joint or constraint, row of Table 1 of the paper) of every row."""
+        """(joint or constraint, name in Table 1 of the paper) of each row."""
         return row_names(self.topology)
 
     @property
     def redundant(self) -> dict[str, tuple[str, ...]]:
-        """Rows of each cut joint and constraint that could be left out, one at a time."""
-        found = {}
+        """{cut joint or constraint: its rows that could be left out, one at a time}."""
+        redundant = {}
         for (name, row), dispensable in zip(self.rows, np.asarray(self.dispensable), strict=True):
             if dispensable:
-                found[name] = (*found.get(name, ()), row)
-        return found
+                redundant[name] = (*redundant.get(name, ()), row)
+        return redundant
 
 
 def row_names(topology: Topology) -> tuple[tuple[str, str], ...]:
-    """(joint or constraint, row of Table 1 of the paper) of every row, those that no motion changes last."""
+    """(joint or constraint, name in Table 1 of the paper) of each row; rows that no motion changes come last."""
     cuts = topology.joints[topology.num_bodies :]
     rotation = lambda rows: [(cuts[cut], ROTATIONS[i, j]) for cut, i, j in rows]
     translation = lambda rows: [(cuts[cut], TRANSLATIONS[i]) for cut, i in rows]
@@ -79,19 +79,27 @@ def mobility(
     mechanism: Mechanism,
     state: State,
     *,
-    t=0.0,
+    t: ArrayLike = 0.0,
     formulation: TangentSpace = DEFAULT_FORMULATION,
     accuracy: Accuracy = BALANCED,
 ) -> Mobility:
-    """Rank, degrees of freedom and redundant constraints of a mechanism at a state on its closed loops.
+    """Find the rank, the degrees of freedom and the redundant constraints at a state on the closed loops.
 
-    **Arguments:** `t`: time [s]; `formulation`: whose rank tolerance decides; `accuracy`: deprecated.
+    **Arguments:**
+
+    - `mechanism`, `state`: see `linkax.simulate`. `t`: time [s].
+    - `formulation`: a `linkax.TangentSpace`, whose rank tolerance decides which rows are independent.
+    - `accuracy`: deprecated.
+
+    **Returns:** a `Mobility`.
+
+    **Raises:** `ValueError` for a state that does not fit the mechanism, and for another formulation.
     """
     check_accuracy(accuracy)
-    formulation = checked_formulation(formulation, accuracy)
-    require_type(formulation, TangentSpace, "formulation", "give linkax.TangentSpace(...)")
+    chosen = checked_formulation(formulation, accuracy)
+    tangent_space = require_type(chosen, TangentSpace, "formulation", "give linkax.TangentSpace(...)")
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
-    return marked(mechanism, _mobility(mechanism, state, t, formulation))
+    return marked(mechanism, _mobility(mechanism, state, t, tangent_space))
 
 
 @quick_compile

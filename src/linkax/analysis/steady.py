@@ -1,6 +1,7 @@
-"""Steady motion: joints that go on at their speeds, as drives ask, and nothing else changes."""
+"""Recognise steady motion: joints go on at their speeds, as drives ask, and nothing else changes."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,31 +26,32 @@ from linkax.xla.batches import one_by_one
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete
 
-# Radians, or lengths of the mechanism, after which a motion is looked at again: incommensurable, so that what is
-# periodic does not repeat there.
+# How far a motion goes until it is checked again [rad, lengths of the mechanism]: incommensurable, so that no periodic
+# change is missed at all of them.
 LATER = np.array([0.7, 1.9, 41.0])
-AGREES = 1e-6  # of speeds, and of forces
+AGREES = 1e-6  # relative error of speeds and forces up to which they count as equal
 
 eigh = one_by_one(jnp.linalg.eigh)
 
 
 def may_move(state: State) -> bool:
-    """Whether a state moves, as far as it is known."""
+    """Whether a state has a speed that is not zero; True where speeds are traced."""
     v = concrete(state.v)
     return v is None or bool(np.any(v != 0.0))
 
 
-def system_in(mechanism: Mechanism, state: State, t, moves: bool) -> System:
-    """The mechanism's numbers, with drives that hold their joints at time t where the state is at rest."""
+def system_in(mechanism: Mechanism, state: State, t: Float[Array, ""], moves: bool) -> System:
+    """The mechanism's numbers; where all speeds of the state are zero, drives hold their joints as at time t [s]."""
     system, unless = system_of(mechanism, state.q.dtype), jnp.any(state.v != 0.0) if moves else False
     return dataclasses.replace(system, constraints=tuple(each.held(t, unless) for each in system.constraints))
 
 
 class Nearby(eqx.Module):
-    """A mechanism near closed coordinates q, in coordinates y of the tangent space: q ⊕ T y.
+    """A mechanism near coordinates q on the closed loops, in coordinates y of the tangent space: q ⊕ T y.
 
-    - `basis`: T, (n_v, n_v), columns orthonormal in a metric, zero where there is no tangent; `dual`: its inverse
-      on the tangent space.
+    - `basis`: T, (n_v, n_v), columns orthonormal in a metric; columns beyond the degrees of freedom are zero.
+    - `dual`: its inverse on the tangent space, (n_v, n_v).
+    - `t`: time [s].
     """
 
     system: System
@@ -59,44 +61,49 @@ class Nearby(eqx.Module):
     basis: Float[Array, "n_v n_v"]
     dual: Float[Array, "n_v n_v"]
 
-    def at(self, y):
-        """Coordinates q."""
+    def at(self, y: Float[Array, " n_v"]) -> Float[Array, " n_q"]:
+        """Coordinates of the tree's joints, q ⊕ T y."""
         return retract(self.system.topology, self.q, self.basis @ y)
 
     @staticmethod
-    def slopes(function, rest):
-        """A function of a vector at `rest`, and its derivative."""
-        follow = lambda change: jax.jvp(function, (rest,), (change,))
-        return jax.vmap(follow, out_axes=(None, 1))(jnp.eye(len(rest), dtype=rest.dtype))
+    def slopes(function: Callable, point: Float[Array, " n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+        """A vector function of a vector at a point, and its derivative."""
+        follow = lambda change: jax.jvp(function, (point,), (change,))
+        return jax.vmap(follow, out_axes=(None, 1))(jnp.eye(len(point), dtype=point.dtype))
 
 
 class Instants(NamedTuple):
-    """Where a motion at constant speeds leads: times [s], and what has moved by then, (k,) and (k, n_v)."""
+    """Later instants of a motion at constant speeds v.
+
+    - `t`: times [s]. `motion`: displacement of the joints until then, v Δt [rad or m].
+    """
 
     t: Float[Array, " k"]
     motion: Float[Array, "k n_v"]
 
 
-def instants(system: System, t, v) -> Instants:
-    """At `LATER`."""
+def instants(system: System, t: Float[Array, ""], v: Float[Array, " n_v"]) -> Instants:
+    """The instants at which the fastest joint has gone as far as `LATER` says."""
     duration = ratio(LATER, lax.stop_gradient(system.fastest(v)), 0.0)
     return Instants(t + duration, duration[:, None] * v)
 
 
-def widest_gap(system: System, t, q) -> Float[Array, ""]:
-    """How far the loops are open, in radians and lengths of the mechanism."""
+def widest_gap(system: System, t: Float[Array, ""], q: Float[Array, " n_q"]) -> Float[Array, ""]:
+    """The largest gap of the loops [rad, lengths of the mechanism]."""
     return gaps(configure(system, t, q)).in_scales(system).widest()
 
 
-def missed_rates(system: System, t, q, v) -> Float[Array, " m"]:
-    """What the speeds of a state miss of those that the loops and drives ask for, relative to the largest of both."""
+def missed_rates(
+    system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+) -> Float[Array, " m"]:
+    """|J v − b| of each loop row and constraint, relative to the largest speed and the largest rate b asked for."""
     asked = rate(system, t)
     size = jnp.maximum(system.fastest(v), largest(asked))
     return jnp.abs(jacobian(configure(system, t, q)) @ v - asked) / jnp.where(size > 0.0, size, 1.0)
 
 
-def of_missed_rate(mechanism: Mechanism, missed, row: int, t) -> str:
-    """What asks for a rate that speeds miss, and the remedy; of `missed` those of constraints come last."""
+def of_missed_rate(mechanism: Mechanism, missed: np.ndarray, row: int, t: Float[Array, ""]) -> str:
+    """Name what asks for the rate of a row of `missed`, in which constraints come last, and the remedy."""
     constraint = row - len(missed) + len(mechanism.constraints)
     what = mechanism.constraints[constraint].display_name if constraint >= 0 else "a loop"
     return (
@@ -106,7 +113,7 @@ def of_missed_rate(mechanism: Mechanism, missed, row: int, t) -> str:
 
 
 def largest_force(motion: Motion) -> Float[Array, ""]:
-    """The sum of sizes of all forces, in balance or not: what rounding of their sum is small against [N m]."""
+    """Sum of the magnitudes of all forces, to which rounding of their sum is relative [N m]."""
     load, system = applied_load(motion), motion.system
     force, moment = inertial_wrench(motion, motion.angular_bias[:-1], motion.bias[:-1])
     size = lambda vectors: jnp.sum(jnp.abs(vectors))
