@@ -101,8 +101,8 @@ from linkax.studies.comparison import Trial as Trial  # noqa: E402
 from linkax.studies.comparison import compare as compare  # noqa: E402
 from linkax.studies.differentiability import Differentiability as Differentiability  # noqa: E402
 from linkax.studies.differentiability import differentiability as differentiability  # noqa: E402
-from linkax.studies.fit import Fit as Fit  # noqa: E402
 from linkax.studies.fit import fit as fit  # noqa: E402
+from linkax.studies.fit_result import Fit as Fit  # noqa: E402
 from linkax.studies.parameters import Bounded as Bounded  # noqa: E402
 from linkax.studies.parameters import Inertia as Inertia  # noqa: E402
 from linkax.studies.parameters import PhysicalInertia as PhysicalInertia  # noqa: E402

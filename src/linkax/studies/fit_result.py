@@ -1,0 +1,70 @@
+"""The result of a fit, and how sure its parameters are."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+
+class Fit(NamedTuple):
+    """The parameters of a fit, their covariance, and how the fit ended.
+
+    - `params`: fitted numbers, in the structure of the initial `params`, with plain numbers in place of `Positive`,
+      `Bounded` and `PhysicalInertia`.
+    - `loss`: the loss, or half the sum of squares of the residual. `residual`: at `params`, (n,); None for a loss.
+    - `names`: of the p numbers in `params`, in the order of `covariance`.
+    - `covariance`: of these numbers, (p, p), estimated from the sensitivities of the residual and its size. Infinite
+      for numbers that the data do not determine; None for a loss, and where the fit ended at an edge or without
+      derivative. `noise`: standard deviation of the residual, None likewise.
+    - `undetermined`: names of the numbers that the data do not determine.
+    - `history`: {"loss": at each step}. `steps`: number of steps.
+    - `ended`: "converged", "stopped early", "diverged", or "out of steps"; "at an edge", where the loss would fall
+      further but the function is not finite there; "no derivative", where the function is finite and its derivative is
+      not.
+    - `spread`: level of confidence -> ends of the intervals; None where `covariance` is.
+    """
+
+    params: Any
+    loss: float
+    residual: np.ndarray | None
+    names: list[str]
+    covariance: np.ndarray | None
+    noise: float | None
+    undetermined: list[str]
+    history: dict[str, np.ndarray]
+    steps: int
+    ended: str
+    spread: Callable[[float], tuple[Any, Any]] | None
+
+    @property
+    def standard_errors(self) -> Any:
+        """Standard deviation of each number, in the structure of `params`.
+
+        **Raises:** `ValueError` for a fit without covariance.
+        """
+        if self.covariance is None:
+            raise self._no_covariance()
+        _, unravel = ravel_pytree(self.params)
+        return jax.tree.map(np.asarray, unravel(jnp.sqrt(jnp.diagonal(self.covariance))))
+
+    def interval(self, level: float = 0.95) -> tuple[Any, Any]:
+        """Lower and upper ends of the confidence intervals of all numbers, each in the structure of `params`.
+
+        They follow from Student's t distribution, and stay within the bounds of `Positive` and `Bounded`.
+
+        **Raises:** `ValueError` for a fit without covariance, and for a level that is not between 0 and 1.
+        """
+        if self.spread is None:
+            raise self._no_covariance()
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"level is {level!r}; it must lie between 0 and 1, such as 0.95")
+        return self.spread(level)
+
+    def _no_covariance(self):
+        return ValueError(
+            f"this fit has no covariance, it ended {self.ended!r}: fit a residual, whose sum of squares is the "
+            "loss, and start where steps lead to a minimum"
+        )

@@ -1,0 +1,250 @@
+"""Search for the parameters of smallest loss, step by step, with a file to go on from."""
+
+import abc
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from linkax.model.numbers import require_type
+from linkax.studies.files import writable_folder, written_whole
+from linkax.studies.fingerprint import fingerprint
+from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.progress import progress_bar
+
+FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
+Mode = Literal["forward", "reverse"]
+
+
+def _linearised(function, z, mode=None):
+    """A function's value and its Jacobian, by forward mode unless `mode` is "reverse"."""
+    if mode == "reverse":
+        value, back = jax.vjp(function, z)
+        return value, jax.vmap(back)(jnp.eye(len(value), dtype=value.dtype))[0]
+    value, along = jax.linearize(function, z)
+    return value, jax.vmap(along, out_axes=-1)(jnp.eye(len(z), dtype=z.dtype))
+
+
+class AbstractSearch(eqx.Module):
+    """Steps towards the smallest loss, in the vector z of `FreeParameters`.
+
+    - `solver`: of optimistix or optax. `function`: (params, *args) -> a residual, or a loss where `is_loss`.
+    - `mode`: of derivatives; None for the cheaper one.
+    """
+
+    solver: Any
+    function: Callable
+    free: FreeParameters
+    mode: Mode | None = eqx.field(static=True)
+    is_loss: bool = eqx.field(static=True)
+
+    def flat(self, z: Float[Array, " p"], args: tuple) -> Float[Array, " n"]:
+        """The residual, or the loss, as a vector."""
+        return ravel_pytree(self.function(self.free.params(z), *args))[0]
+
+    @abc.abstractmethod
+    def begin(self, z: Float[Array, " p"], args: tuple) -> Any:
+        """The solver's state at z."""
+
+    @abc.abstractmethod
+    def step(
+        self, z: Float[Array, " p"], state: Any, args: tuple
+    ) -> tuple[Float[Array, " p"], Any, Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+        """The next z and state, a loss, whether its derivative is finite, and whether the search has converged.
+
+        The loss is that at the next z for `Squares`, and at this z for `Descent`.
+        """
+
+
+@eqx.filter_jit
+def sensitivity(
+    search: AbstractSearch, z: Float[Array, " p"], args: tuple
+) -> tuple[Float[Array, " n"], Float[Array, "n p"]]:
+    """The residual at z, and its derivative."""
+    return _linearised(lambda z: search.flat(z, args), z, search.mode)
+
+
+class Squares(AbstractSearch):
+    """Steps of a least-squares solver of optimistix."""
+
+    def _residual(self):
+        """The residual, with its Jacobian by forward mode as the reverse rule: the solver keeps an array from it."""
+        if self.mode == "reverse":
+            return lambda z, args: (self.flat(z, args), None)
+
+        def residual(z, args):
+            flat = jax.custom_vjp(lambda z: self.flat(z, args))
+            flat.defvjp(lambda z: _linearised(lambda z: self.flat(z, args), z), lambda slopes, along: (along @ slopes,))
+            return flat(z), None
+
+        return residual
+
+    def begin(self, z, args):
+        shape = jax.eval_shape(self.flat, z, args)
+        return self.solver.init(self._residual(), z, args, {"jac": "bwd"}, shape, None, frozenset())
+
+    def step(self, z, state, args):
+        z, state, _ = self.solver.step(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
+        done, _ = self.solver.terminate(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
+        smooth = jnp.all(jnp.isfinite(state.f_info.jac.as_matrix()))
+        return z, state, 0.5 * jnp.sum(state.f_info.residual**2), smooth, done
+
+
+class Descent(AbstractSearch):
+    """Steps of an optimiser of optax, which never tells that it has converged."""
+
+    def begin(self, z, args):
+        return self.solver.init(z)
+
+    def step(self, z, state, args):
+        def loss(z):
+            value = self.flat(z, args)
+            return value[0] if self.is_loss else 0.5 * jnp.sum(value**2)
+
+        forward = len(z) <= FEW if self.mode is None else self.mode == "forward"
+        value, slope = _linearised(loss, z) if forward else jax.value_and_grad(loss)(z)
+        solver = optax.with_extra_args_support(self.solver)
+        update, state = solver.update(slope, state, z, value=value, grad=slope, value_fn=loss)
+        moved: Any = optax.apply_updates(z, update)
+        return moved, state, value, jnp.all(jnp.isfinite(slope)), jnp.zeros((), bool)
+
+
+@eqx.filter_jit
+def _begin(search, z, args):
+    return search.begin(z, args)
+
+
+@eqx.filter_jit
+def _step(search, z, state, args):
+    return search.step(z, state, args)
+
+
+def run_search(
+    search: AbstractSearch,
+    args: tuple,
+    steps: int,
+    tolerance: float,
+    patience: int | None,
+    checkpoint: str | os.PathLike | None,
+    progress: bool | None,
+) -> tuple[Float[Array, " p"], list[float], str]:
+    """Search from the start of the parameters; see `linkax.fit` for the arguments.
+
+    **Returns:** the z of smallest loss, the loss at each step, and how the search ended, as in `linkax.Fit`.
+
+    **Raises:** `ValueError` where the function is not finite or has no derivative at the start, and for a checkpoint
+    of another fit.
+    """
+    z = search.free.start
+    state = _begin(search, z, args)
+    losses, best, best_z, waited = [], np.inf, z, 0
+    kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, state, args)
+    if kept is not None and kept.path.exists():
+        (z, best_z, state), losses, waited = kept.load((z, best_z, state))
+        best = min(losses)
+    ended = None
+    with progress_bar(steps, "step", progress, initial=len(losses)) as bar:
+        while ended is None and len(losses) < steps + 1:
+            before = z
+            z, state, loss, smooth, done = _step(search, z, state, args)
+            loss = float(loss)
+            if not losses:
+                _check_start(loss, smooth)
+            losses.append(loss)
+            here = z if isinstance(search, Squares) else before
+            waited = 0 if not np.isfinite(best) or loss < best - tolerance * abs(best) else waited + 1
+            best, best_z = (loss, here) if loss <= best else (best, best_z)
+            bar.set_description("fitting")
+            bar.set_postfix(loss=f"{loss:.6g}")
+            bar.update()
+            if kept is not None:
+                kept.save((z, best_z, state), losses, waited)
+            ended = _ending(loss, smooth, done, patience is not None and waited >= patience)
+    return best_z, losses, ended or "out of steps"
+
+
+def _ending(loss, smooth, done, impatient) -> str | None:
+    """How a search ends with this step, or None where it goes on."""
+    if not np.isfinite(loss):
+        return "diverged"
+    if not smooth:
+        return "no derivative"
+    if done:
+        return "converged"
+    return "stopped early" if impatient else None
+
+
+def _check_start(loss, smooth):
+    """Whether a search can begin."""
+    if not np.isfinite(loss):
+        raise ValueError(
+            "the function is not finite at the parameters where the fit starts: look at solution.result of a single "
+            "run with them"
+        )
+    if not smooth:
+        raise ValueError(
+            "the function has no derivative at the parameters where the fit starts, as a square root has none at zero; "
+            "start elsewhere, or ask `linkax.differentiability`"
+        )
+
+
+class _Checkpoint(NamedTuple):
+    """A file with all that a search needs to go on.
+
+    - `names`: of the parameters. `identity`: fingerprint of the step's program and its numbers.
+    """
+
+    path: Path
+    names: list[str]
+    identity: str
+
+    @staticmethod
+    def of(path, search, z, state, args) -> "_Checkpoint":
+        path = Path(require_type(path, str | os.PathLike, "checkpoint", "give the name of a file"))
+        writable_folder(path.parent, f"give another checkpoint than {str(path)!r}")
+        if path.is_dir():
+            raise ValueError(f"checkpoint {str(path)!r} is a folder; give the name of a file")
+        text = cast(Any, _step).lower(search, z, state, args).as_text()
+        numbers = jax.tree.leaves(eqx.filter((search, z, args), eqx.is_array))
+        return _Checkpoint(path, search.free.names, fingerprint(text, numbers))
+
+    def save(self, tree, losses, waited):
+        """Write the arrays of `tree`, the losses, and the number of steps that gained nothing."""
+        header = json.dumps({"names": self.names, "fit": self.identity, "losses": losses, "waited": waited})
+        leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array))
+        arrays: dict[str, Any] = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+        with written_whole(self.path) as file, open(file, "wb") as stream:
+            np.savez(stream, header=np.array(header), **arrays)
+
+    def load(self, like):
+        """Read what `save` wrote; `like` is a tree of the same structure.
+
+        **Raises:** `ValueError` for a file of something else.
+        """
+        arrays, static = eqx.partition(like, eqx.is_array)
+        leaves, structure = jax.tree.flatten(arrays)
+        try:
+            with np.load(self.path) as file:
+                header = json.loads(str(file["header"]))
+                stored = [file[f"leaf_{i}"] for i in range(len(file.files) - 1)]
+        except (AttributeError, EOFError, KeyError, OSError, ValueError, zipfile.BadZipFile) as error:
+            other = f"checkpoint {str(self.path)!r} holds something else than a fit"
+            raise ValueError(f"{other}; give another file, or remove this one") from error
+        if header.get("fit") != self.identity:
+            raise ValueError(
+                f"checkpoint {str(self.path)!r} holds another fit, of {', '.join(header['names'])} (parameters, their "
+                "start or bounds, the data, the function, the optimiser or versions have changed); give another file, "
+                "or remove this one"
+            )
+        stored = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(stored, leaves, strict=True)]
+        return eqx.combine(jax.tree.unflatten(structure, stored), static), header["losses"], header["waited"]
