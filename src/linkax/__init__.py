@@ -109,5 +109,5 @@ from linkax.studies.parameters import PhysicalInertia as PhysicalInertia  # noqa
 from linkax.studies.parameters import Positive as Positive  # noqa: E402
 from linkax.studies.shooting import Shots as Shots  # noqa: E402
 from linkax.studies.shooting import shoot as shoot  # noqa: E402
-from linkax.studies.sweep import Sweep as Sweep  # noqa: E402
 from linkax.studies.sweep import sweep as sweep  # noqa: E402
+from linkax.studies.sweep_result import Sweep as Sweep  # noqa: E402

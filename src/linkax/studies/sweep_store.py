@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import zarr
+from zarr.storage import MemoryStore
 
 from linkax.studies.files import synced, writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
@@ -72,7 +73,9 @@ class SweepStore(NamedTuple):
         with zarr.config.set({"array.write_empty_chunks": True}):
             group = zarr.open_group(path, mode="r+", use_consolidated=False)
             arrays = tuple(group[name] for name in ["reason", *_names("output", program.outputs[0])])
-            return SweepStore(path, sweep, program.size, group["done"], arrays)
+            done = group["done"]
+            assert isinstance(done, zarr.Array)
+            return SweepStore(path, sweep, program.size, done, arrays)
 
     def load(self, found) -> set:
         """Read what is there into (outputs, reasons); returns where the chunks begin that are done.
@@ -163,7 +166,7 @@ def _known_files(identity, program, params, order, not_run) -> dict[str, bytes]:
     outputs, reason = program.outputs
     count, chunks = len(order), -(-len(order) // program.size)
     kept = {}
-    group = zarr.create_group(zarr.storage.MemoryStore(kept), attributes=identity)
+    group = zarr.create_group(MemoryStore(kept), attributes=identity)
 
     def add(name, dtype, fill_value, shape=(count,), size=program.size):
         labels = identity if name in LABELLED else {}

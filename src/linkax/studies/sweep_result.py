@@ -1,0 +1,61 @@
+"""The result of a sweep, and how its members ended."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Int
+
+from linkax.simulation.integrate.results import ENDED_WELL, KNOWN_RESULTS, REMARKS, RESULTS
+from linkax.xla.enumerations import code
+
+REASONS = (*KNOWN_RESULTS, "failed", "not_finite_output", "not_run")
+FINE = [REASONS.index(name) for name in ENDED_WELL]
+NOT_FINITE_OUTPUT, NOT_RUN = (REASONS.index(name) for name in ("not_finite_output", "not_run"))
+EXPLANATIONS = {
+    "failed": "failed",
+    "not_finite_output": "The function returned numbers that are not finite, and no solution or result that tells why.",
+    "not_run": "This member has not been run.",
+}
+
+
+class Sweep(NamedTuple):
+    """Outputs of a function for the n members of a batch, and how each member ended.
+
+    - `output`: as the function returns it, arrays with a leading axis of members; where a member failed, what it had
+      computed until then.
+    - `reasons`: how each member ended, as an index into `linkax.studies.sweep_result.REASONS`, (n,).
+    - `seconds_per_member`: wall time without compilation [s]; NaN where a store held all members already.
+    - `remarks`: a `linkax.REMARKS` of each member, (n,): what a single run would warn of. Known where the function
+      returns a `Solution` or `solution.remark()`.
+    """
+
+    output: Any
+    reasons: Int[np.ndarray, " n"]
+    seconds_per_member: float
+    remarks: REMARKS
+
+    @property
+    def ok(self) -> Bool[np.ndarray, " n"]:
+        """Whether each member ended well, (n,)."""
+        return np.isin(self.reasons, FINE)
+
+    @property
+    def failed(self) -> dict[int, str]:
+        """{member: why it failed}."""
+        return {member: self.reason(member) for member in np.flatnonzero(~self.ok).tolist()}
+
+    def reason(self, member: int) -> str:
+        """How a member ended, in words."""
+        name = REASONS[self.reasons[member]]
+        return EXPLANATIONS[name] if name in EXPLANATIONS else RESULTS[getattr(RESULTS, name)]
+
+    @property
+    def remarked(self) -> dict[int, str]:
+        """{member: its remark, in words}, of members that have one."""
+        each = lambda member: REMARKS[jax.tree.map(lambda values: np.asarray(values[member]), self.remarks)]
+        return {member: each(member) for member in np.flatnonzero(code(self.remarks)).tolist()}
+
+    def count(self) -> dict[str, int]:  # type: ignore[override]  # hides that of tuples
+        """{name of a result: number of members that ended so}."""
+        return {name: int(np.sum(self.reasons == index)) for index, name in enumerate(REASONS) if index in self.reasons}
