@@ -95,10 +95,10 @@ from linkax.simulation.start.assembly import AssemblyError as AssemblyError  # n
 from linkax.simulation.start.assembly import AssemblyWarning as AssemblyWarning  # noqa: E402
 from linkax.simulation.start.assembly import assemble as assemble  # noqa: E402
 from linkax.simulation.start.state import State as State  # noqa: E402
-from linkax.studies.comparison import Comparison as Comparison  # noqa: E402
 from linkax.studies.comparison import Stepping as Stepping  # noqa: E402
-from linkax.studies.comparison import Trial as Trial  # noqa: E402
 from linkax.studies.comparison import compare as compare  # noqa: E402
+from linkax.studies.comparison_result import Comparison as Comparison  # noqa: E402
+from linkax.studies.comparison_result import Trial as Trial  # noqa: E402
 from linkax.studies.differentiability import Differentiability as Differentiability  # noqa: E402
 from linkax.studies.differentiability import differentiability as differentiability  # noqa: E402
 from linkax.studies.fit import fit as fit  # noqa: E402

@@ -4,7 +4,7 @@ from matplotlib.figure import Figure
 
 from linkax.formulations.named import TANGENT_SPACE
 from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
-from linkax.studies.comparison import Comparison
+from linkax.studies.comparison_result import Comparison
 
 COLOURS = (VERMILION, GREEN, ORANGE, PURPLE, SKY, INK, FAINT)
 MARKERS = {"": "o", "baumgarte": "s", "partitioning": "^", "projection": "D"}

@@ -1,4 +1,4 @@
-"""Formulations side by side on one mechanism."""
+"""Compare formulations of the equations of motion on one mechanism."""
 
 import dataclasses
 import functools
@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from linkax.equations.system import system_of
@@ -26,12 +27,13 @@ from linkax.simulation.read.solution import Solution
 from linkax.simulation.simulate import fixed_steps, simulate
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time
+from linkax.studies.comparison_result import Comparison, Trial
 
-TIGHTEST, NEXT_TO_IT = 1e-13, 1e-12  # tolerances of the reference and of its check
-DIVERGED = 1e-2  # of the mechanism's length
-OPEN = 1e-3  # violation of positions [rad, or lengths of the loop]
-INSTANT = 1e-6  # of the whole time
-LONG_RUN = 0.5  # a run that takes longer [s] is timed once
+TIGHTEST, NEXT_TO_IT = 1e-13, 1e-12  # tolerances of the reference run and of the run that checks it
+DIVERGED = 1e-2  # default bound of the error, in lengths of the mechanism
+OPEN = 1e-3  # violation of positions from which loops are told to be open [rad, or lengths of the loop]
+INSTANT = 1e-6  # duration of the run that compiles, relative to the whole
+LONG_RUN = 0.5  # a run that takes longer is timed once [s]
 STOPPED = {
     "dt_min_reached": "the step size fell to nothing",
     "max_steps_reached": "out of steps",
@@ -39,53 +41,8 @@ STOPPED = {
 }
 
 
-class Trial(NamedTuple):
-    """One run of a formulation.
-
-    - `rtol` of adaptive steps, or `step` of fixed ones [s]; the other is None.
-    - `error`: largest distance of any point from the known answer, at all times reached [m].
-    - `position_violation`, `velocity_violation`, `acceleration_violation`: see `Solution.worst_violation`.
-    - `energy_error`: largest difference from the reference run's energy, over its largest kinetic energy [J if none].
-    - `steps`, `evaluations`: of the solver, and of the equations of motion in them. `run_s`: wall time [s].
-    - `reached` [s]. `verdict`: "converged", or "diverged": the run ended early, or its error is above the bound.
-    - `diverged_at`: where it ended early, or its error first was above the bound [s]; None where it converged.
-    - `why`: how it diverged, in words.
-    """
-
-    formulation: str
-    rtol: float | None
-    step: float | None
-    error: float
-    position_violation: float
-    velocity_violation: float
-    acceleration_violation: float
-    energy_error: float
-    steps: int
-    evaluations: int | None
-    run_s: float
-    reached: float
-    verdict: str
-    diverged_at: float | None
-    why: str
-
-
-class Comparison(NamedTuple):
-    """What was compared, and with what.
-
-    - `answer`: the known answer: "closed form", or the reference run, the paper's formulation at a tolerance of 1e-13.
-    - `uncertainty`: how far the reference run is from the closed form, or from a run at 1e-12 [m].
-    - `bound`: an error above counts as diverged [m]. `passages`: through singular configurations [s].
-    """
-
-    answer: str
-    uncertainty: float
-    bound: float
-    passages: list[float]
-    trials: list[Trial]
-
-
 class Stepping(NamedTuple):
-    """Adaptive steps to a tolerance, or fixed steps [s]."""
+    """A solver with adaptive steps to a tolerance `rtol`, or with fixed steps of size `step` [s]."""
 
     solver: diffrax.AbstractSolver
     rtol: float | None = None
@@ -112,74 +69,101 @@ def compare(
 
     - `mechanism`, `state`: see `linkax.simulate`.
     - `points`: {name: (body, frame of the body or None for its centre of mass)}, whose positions are compared.
-    - `steppings`: how to step; every formulation is run with each of them.
+    - `steppings`: how to step; each formulation runs with each of them.
     - `formulations`: names of `linkax.formulations.named`, or {name of one's own: formulation}.
-    - `exact`: times -> positions of the points, (n_t, 3) each [m], or None, where they are known in closed form.
-    - `bound`: of the error [m]; default: a hundredth of the mechanism's length.
-    - `repeats`: of each run, of which the shortest counts.
-    - `report`: called with what happens now, and with the fraction done where that is known.
+    - `exact`: times -> {name of a point: positions, (n_t, 3) [m]}, the closed form, or None where there is none.
+    - `bound`: of the error [m]; by default a hundredth of the mechanism's length.
+    - `repeats`: number of runs of each trial, of which the shortest time counts.
+    - `report`: called with the current phase, and with the fraction done where that is known.
     - `keep`: called with the comparison so far, after each formulation.
 
-    **Returns:** a `Comparison`, of trials in the order of formulations, for each of these of steppings.
+    **Returns:** a `Comparison`, its trials in the order of the formulations, and for each of these of the steppings.
 
-    **Raises:** `ValueError` for an unknown name; `SimulationError` where the paper's formulation cannot do the motion.
+    **Raises:** `ValueError` for an unknown name; `SimulationError` where the paper's formulation cannot integrate the
+    motion.
     """
     state, t1 = checked_state(mechanism, state), float(checked_time(t1, "t1"))
     _check_points(mechanism, points)
     _check_asked(t1, steppings, formulations, bound, repeats)
-    chosen = dict(formulations) if isinstance(formulations, Mapping) else {name: named(name) for name in formulations}
-    classical = {name: entry for name, entry in chosen.items() if isinstance(entry, ClassicalFormulation)}
-    chosen |= dict(zip(classical, in_one_program(list(classical.values())), strict=True))
-    times = np.linspace(0.0, t1, DEFAULT_SAVES)
-    positions = lambda found: {name: np.asarray(found.position(*point)) for name, point in points.items()}
+    chosen = _chosen(formulations)
+    motion = _Motion(mechanism, state, points, np.linspace(0.0, t1, DEFAULT_SAVES))
+    report("compiling the reference run", None)
+    reference, answer, comparison = _reference(motion, exact)
+    if bound is not None:
+        comparison = comparison._replace(bound=bound)
+    for count, (name, formulation) in enumerate(chosen.items()):
+        report(f"running {name}", count / len(chosen))
+        for stepping in steppings:
+            motion.run(formulation, stepping, INSTANT)  # compiles, where no formulation before it has
+            solution, seconds = _timed(functools.partial(motion.run, formulation, stepping), repeats)
+            apart = np.where(np.isfinite(solution.ts), _apart(motion.positions(_plain(solution)), answer), 0.0)
+            trial = _trial(name, stepping, solution, seconds, apart, comparison, reference)
+            comparison = comparison._replace(trials=[*comparison.trials, trial])
+        keep(comparison)
+    return comparison
 
-    def run(formulation, stepping, times=times, throw=False):
-        found = simulate(
-            mechanism,
-            state,
+
+class _Motion(NamedTuple):
+    """The motion to integrate, its points to compare, and the times to save [s]."""
+
+    mechanism: Mechanism
+    state: State
+    points: Mapping[str, tuple[str, str | None]]
+    times: np.ndarray
+
+    def run(self, formulation, stepping, part=1.0, throw=False) -> Solution:
+        """Integrate the first `part` of the time."""
+        times, t1 = part * self.times, float(self.times[-1])
+        solution = simulate(
+            self.mechanism,
+            self.state,
             t1=times[-1],
             accuracy=Accuracy(rtol=TIGHTEST if stepping.rtol is None else stepping.rtol),
             formulation=formulation,
             solver=stepping.solver,
-            saveat=diffrax.SaveAt(ts=times),
+            saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
             throw=throw,
             **fixed_steps(stepping.step, t1),
         )
-        return jax.block_until_ready(found)
+        return jax.block_until_ready(solution)
 
-    report("compiling the reference run", None)
-    reference = run(DEFAULT_FORMULATION, Stepping(diffrax.Dopri8(), rtol=TIGHTEST), throw=True)
-    known = None if exact is None else exact(times)
-    answer = positions(reference) if known is None else known
-    other = (
-        run(DEFAULT_FORMULATION, Stepping(diffrax.Dopri8(), rtol=NEXT_TO_IT), throw=True)
-        if known is None
-        else reference
+    def positions(self, solution) -> dict[str, np.ndarray]:
+        """{name of a point: positions, (n_t, 3) [m]}."""
+        return {name: np.asarray(solution.position(*point)) for name, point in self.points.items()}
+
+
+def _reference(motion, exact) -> tuple[Solution, Mapping[str, np.ndarray], Comparison]:
+    """The reference run, the known answer, and a comparison with it that has no trials yet."""
+    at_tolerance = lambda rtol: motion.run(DEFAULT_FORMULATION, Stepping(diffrax.Dopri8(), rtol=rtol), throw=True)
+    reference = at_tolerance(TIGHTEST)
+    known = None if exact is None else exact(motion.times)
+    answer = motion.positions(reference) if known is None else known
+    other = at_tolerance(NEXT_TO_IT) if known is None else reference
+    comparison = Comparison(
+        answer="reference run" if known is None else "closed form",
+        uncertainty=float(np.max(_apart(motion.positions(other), answer))),
+        bound=DIVERGED * float(system_of(motion.mechanism, float).length),
+        passages=[float(passage) for passage in reference.passages().times],
+        trials=[],
     )
-    bound = DIVERGED * float(system_of(mechanism, float).length) if bound is None else bound
-    passages = [float(passage) for passage in reference.passages().times]
-    uncertainty = float(np.max(_apart(positions(other), answer)))
-    kind = "reference run" if known is None else "closed form"
-    found = Comparison(kind, uncertainty, bound, passages, [])
-    for count, (name, formulation) in enumerate(chosen.items()):
-        report(f"running {name}", count / len(chosen))
-        for stepping in steppings:
-            run(formulation, stepping, INSTANT * times)  # compiles, where no formulation before it has
-            solution, seconds = _timed(functools.partial(run, formulation, stepping), repeats)
-            apart = np.where(np.isfinite(solution.ts), _apart(positions(_plain(solution)), answer), 0.0)
-            trial = _trial(name, stepping, solution, seconds, apart, bound, reference, passages)
-            found = found._replace(trials=[*found.trials, trial])
-        keep(found)
-    return found
+    return reference, answer, comparison
+
+
+def _chosen(formulations) -> dict[str, AbstractFormulation]:
+    """{name: formulation}, the classical ones in one program."""
+    is_own = isinstance(formulations, Mapping)
+    chosen = {name: formulations[name] if is_own else named(name) for name in formulations}
+    classical = {name: entry for name, entry in chosen.items() if isinstance(entry, ClassicalFormulation)}
+    return chosen | dict(zip(classical, in_one_program(list(classical.values())), strict=True))
 
 
 def _check_points(mechanism, points):
     if not isinstance(points, Mapping) or not points:
         raise ValueError(f"points are {points!r}; give {{name: (body, frame of the body or None)}}")
-    for body, at in points.values():
-        found = mechanism.body(body)
+    for name, at in points.values():
+        body = mechanism.body(name)
         if at is not None:
-            found.at(at)
+            body.at(at)
 
 
 def _check_asked(t1, steppings, formulations, bound, repeats):
@@ -196,52 +180,44 @@ def _check_asked(t1, steppings, formulations, bound, repeats):
 
 
 def _timed(run, repeats):
-    """What a run finds, and the shortest time that it takes [s]."""
-    shortest = np.inf
-    for _ in range(repeats):
+    """A run's solution, and the shortest time that it takes [s]."""
+
+    def timed():
         began = time.perf_counter()
-        found = run()
-        shortest = min(shortest, time.perf_counter() - began)
+        return run(), time.perf_counter() - began
+
+    solution, shortest = timed()
+    for _ in range(repeats - 1):
         if shortest > LONG_RUN:
             break
-    return found, shortest
+        solution, seconds = timed()
+        shortest = min(shortest, seconds)
+    return solution, shortest
 
 
-def _plain(found) -> Solution:
-    """The same motion, read by programs that all formulations share."""
-    return dataclasses.replace(found, run=found.run.changed(formulation=DEFAULT_FORMULATION))
+def _plain(solution) -> Solution:
+    """The same motion, with the default formulation, so that all share the programs that read it."""
+    return dataclasses.replace(solution, run=solution.run.changed(formulation=DEFAULT_FORMULATION))
 
 
 def _apart(positions, answer):
-    """Largest distance of any point at each time [m], infinite where a number is not finite."""
+    """Largest distance of any point from the answer at each time [m]; infinite where a number is not finite."""
     with np.errstate(invalid="ignore", over="ignore"):
         distances = [np.linalg.norm(positions[name] - answer[name], axis=-1) for name in answer if name in positions]
     largest = np.max(distances, axis=0)
     return np.where(np.isfinite(largest), largest, np.inf)
 
 
-def _trial(name, stepping, found, seconds, apart, bound, reference, passages) -> Trial:
-    finished = bool(found.result == RESULTS.successful)
-    reached = np.isfinite(np.asarray(found.ts))
-    energy = np.asarray(_plain(found).energy() - reference.energy())[reached]
+def _trial(name, stepping, solution, seconds, apart, comparison, reference) -> Trial:
+    """A trial, from its solution, run time and the distances `apart` from the answer."""
+    reached = np.isfinite(np.asarray(solution.ts))
+    energy = np.asarray(_plain(solution).energy() - reference.energy())[reached]
     kinetic = np.max(np.asarray(reference.kinetic_energy()))
     error = float(np.max(apart))
-    verdict = "converged" if finished and error <= bound else "diverged"
-    diverged_at, why = None, ""
-    if not finished:
-        diverged_at = float(found.t_end)
-        why = f"stopped at {diverged_at:.4g} s: {STOPPED.get(result_name(found.result), 'failed')}."
-        why += cause(found)
-    elif verdict == "diverged":
-        first = int(np.argmax(apart > bound))
-        gap = float(found.violation().position[first])
-        loops = f"loops open by {gap:.0e}" if gap > OPEN else f"loops closed to {gap:.0e}"
-        diverged_at = float(found.ts[first])
-        why = f"off by more than {bound:.2g} m at {diverged_at:.4g} s, {loops}"
-        before = [passage for passage in passages if passage <= diverged_at]
-        why += f"; last singular passage at {before[-1]:.4g} s." if before else "."
-    worst = found.worst_violation()
-    steps = int(found.stats["num_steps"])
+    converged = bool(solution.result == RESULTS.successful) and error <= comparison.bound
+    diverged_at, why = (None, "") if converged else _divergence(solution, apart, comparison)
+    worst = solution.worst_violation()
+    steps = int(solution.stats["num_steps"])
     return Trial(
         formulation=name,
         rtol=stepping.rtol,
@@ -252,17 +228,34 @@ def _trial(name, stepping, found, seconds, apart, bound, reference, passages) ->
         acceleration_violation=float(worst.acceleration),
         energy_error=float(np.max(np.abs(energy), initial=0.0) / (kinetic if kinetic > 0.0 else 1.0)),
         steps=steps,
-        evaluations=evaluations(stepping.solver, steps, found.formulation.moves_after_steps),
+        evaluations=evaluations(stepping.solver, steps, solution.formulation.moves_after_steps),
         run_s=seconds,
-        reached=float(found.t_end),
-        verdict=verdict,
+        reached=float(solution.t_end),
+        verdict="converged" if converged else "diverged",
         diverged_at=diverged_at,
         why=why,
     )
 
 
-def evaluations(solver, steps: int, anew: bool = False) -> int | None:
-    """Evaluations of the equations of motion in so many Runge-Kutta steps; `anew`: that at the start of each too."""
+def _divergence(solution, apart, comparison) -> tuple[float, str]:
+    """When a trial diverged [s], and how, in words."""
+    if not bool(solution.result == RESULTS.successful):
+        stopped = float(solution.t_end)
+        how = STOPPED.get(result_name(solution.result), "failed")
+        return stopped, f"stopped at {stopped:.4g} s: {how}.{cause(solution)}"
+    first = int(np.argmax(apart > comparison.bound))
+    diverged_at, gap = float(solution.ts[first]), float(solution.violation().position[first])
+    loops = f"loops open by {gap:.0e}" if gap > OPEN else f"loops closed to {gap:.0e}"
+    before = [passage for passage in comparison.passages if passage <= diverged_at]
+    passage = f"; last singular passage at {before[-1]:.4g} s." if before else "."
+    return diverged_at, f"off by more than {comparison.bound:.2g} m at {diverged_at:.4g} s, {loops}{passage}"
+
+
+def evaluations(solver: diffrax.AbstractSolver, steps: int, anew: bool = False) -> int | None:
+    """Number of evaluations of the equations of motion in a number of Runge-Kutta steps; None for other solvers.
+
+    `anew`: whether each step evaluates them at its start, also where its method could reuse the last stage.
+    """
     tableau = getattr(solver, "tableau", None)
     if tableau is None:
         return None
@@ -271,13 +264,13 @@ def evaluations(solver, steps: int, anew: bool = False) -> int | None:
 
 
 def at_equal_cost(trials: Sequence[Trial], budget_s: float) -> list[Trial]:
-    """Of each formulation the trial of the smallest error among those that converged within `budget_s` [s].
+    """Of each formulation, the trial of smallest error among those that converged within `budget_s` [s].
 
-    Where none did, the fastest one.
+    Where none did, its fastest trial.
     """
-    found = []
+    best = []
     for name in dict.fromkeys(trial.formulation for trial in trials):
         own = [trial for trial in trials if trial.formulation == name]
         finished = [trial for trial in own if trial.verdict == "converged" and trial.run_s <= budget_s]
-        found.append(min(finished, key=lambda t: t.error) if finished else min(own, key=lambda t: t.run_s))
-    return found
+        best.append(min(finished, key=lambda t: t.error) if finished else min(own, key=lambda t: t.run_s))
+    return best
