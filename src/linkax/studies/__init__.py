@@ -1,1 +1,1 @@
-"""Many runs, and what they say together."""
+"""Studies of many runs: sweeps, fits, comparisons, differentiability."""

@@ -1,4 +1,7 @@
-"""Whether a motion has derivatives: none by parameters that contradict redundant loops, or undo a singular position."""
+"""Find by which parameters a motion has no derivative.
+
+These are parameters whose change contradicts redundant constraints, or undoes a singular configuration.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from linkax.analysis.mobility import row_names
 from linkax.equations.configuration import configure
@@ -18,49 +22,52 @@ from linkax.simulation.read.passages import singular_states
 from linkax.simulation.read.solution import Solution
 from linkax.studies.free_parameters import FreeParameters
 
-DEPENDENT = 1e-4  # singular values of J in radians and lengths of the mechanism: of rows that depend on others
-OPENS = 1e-3  # the part of a change of the loops that no motion takes back
-SEEN = 3.0  # times the smallest distance of any stage, above which saved times do not show it
-ROUNDING = 1e-9  # of rows, by relative changes of parameters
+DEPENDENT = 1e-4  # singular value of J [rad, lengths of the mechanism] up to which a row depends on others
+OPENS = 1e-3  # part of a change of the loops, relative to it, from which it counts as one that no motion closes
+SEEN = 3.0  # smallest distance at saved times, relative to that at any stage, above which saved times miss it
+ROUNDING = 1e-9  # error of the derivatives of rows by relative changes of parameters
 
 
 class Differentiability(NamedTuple):
     """By which parameters a motion has derivatives.
 
-    - `names`: of the p free numbers in `params`; those of a `PhysicalInertia` have the same one.
-    - `reasons`: of each that it has no derivative by, why.
-    - `directions`: changes of all parameters together that keep what is there, as orthonormal columns (p, k), each
-      parameter in units of its own value.
+    - `names`: of the p free numbers in `params`; those of a `PhysicalInertia` share one name.
+    - `reasons`: {name of a number that the motion has no derivative by: why}.
+    - `directions`: changes of all parameters together that keep redundant constraints and singular configurations, as
+      orthonormal columns, (p, k), each parameter in units of its own value.
     """
 
     names: list[str]
     reasons: dict[str, str]
-    directions: np.ndarray
+    directions: Float[np.ndarray, "p k"]
 
     @property
     def ok(self) -> bool:
-        """Whether there are derivatives by all parameters."""
+        """Whether the motion has derivatives by all parameters."""
         return not self.reasons
 
-    def __str__(self):
+    def __str__(self) -> str:
         return "\n".join(f"{name}: {self.reasons.get(name, 'differentiable')}" for name in self.names)
 
 
-def differentiability(function: Callable, params: Any) -> Differentiability:
-    """Find by which parameters the motion has derivatives.
+def differentiability(function: Callable[[Any], Solution], params: Any) -> Differentiability:
+    """Find by which parameters a motion has derivatives.
 
-    Where constraints are redundant, always or in a singular configuration alone, a change of a length may contradict
-    them: the mechanism locks, or its branches part and it turns back where it went through. `jax.grad` by such a
-    parameter is the derivative of the motion that comes nearest, which is not that of the mechanism. To first order
-    this is so where uᵀ ∂c/∂θ ≠ 0 for a u with uᵀ J = 0; that is looked for at all saved states and passages.
+    Where constraints are redundant, always or only in a singular configuration, a changed length can contradict them:
+    the mechanism locks, or its branches part, and it turns back where it passed through. There `jax.grad` returns the
+    derivative of the nearest motion that closes the loops, which is not that of the mechanism. To first order this
+    happens to a parameter θ where uᵀ ∂c/∂θ ≠ 0 for some u with uᵀ J = 0, which is tested at all saved states and
+    passages.
 
     **Arguments:**
 
-    - `function`: params -> a `Solution` of one motion that went well, such as what `simulate` returns.
+    - `function`: params -> a `Solution` of one motion that ended well, such as that of `simulate`.
     - `params`: pytree of numbers and arrays, as for `linkax.fit`.
 
-    **Raises:** `ValueError` for a function that returns no `Solution`, a batch, or one of a run that failed, and for
-    saved times too far apart to show singular configurations.
+    **Returns:** a `Differentiability`.
+
+    **Raises:** `ValueError` for a function that returns no `Solution`, a batch, or the solution of a run that failed,
+    and for saved times too far apart to show singular configurations.
     """
     require_type(function, Callable, "function", "give a function that returns a linkax.Solution")
     free = FreeParameters.of(params)
@@ -115,7 +122,7 @@ def _unfolds(joint, t):
 
 @eqx.filter_jit
 def _linearised(function, free, mechanism, ts, qs):
-    """J of all rows of a mechanism, and their changes with the parameters, at given coordinates."""
+    """J of all rows in the scales, and ∂c/∂z of all rows, at coordinates `qs` and times `ts`."""
     dtype = qs.dtype
 
     def opened(z):

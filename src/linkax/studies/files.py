@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and where they can be."""
+"""Write files so that each is whole or absent, and check that folders can be written to."""
 
 import contextlib
 import os
@@ -11,7 +11,10 @@ UNFINISHED = ".unfinished-"
 
 
 def writable_folder(path: Path, remedy: str) -> Path:
-    """A folder, made where it is not there, and tried before work is done whose results are to go there."""
+    """Make a folder where it does not exist, and check that it can be written to, before results are computed for it.
+
+    **Raises:** `ValueError` where it cannot, which ends with the `remedy`.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path, prefix=UNFINISHED):
@@ -23,11 +26,11 @@ def writable_folder(path: Path, remedy: str) -> Path:
 
 @contextlib.contextmanager
 def written_whole(path: Path, exclusive: bool = False) -> Iterator[Path]:
-    """A temporary path to write to, renamed to `path` once all went well and is on disk, and removed otherwise.
+    """Yield a temporary path, and rename it to `path` once the file is on disk; remove it where the block fails.
 
     **Raises:** `FileExistsError` where `exclusive`, and another process was first.
     """
-    # A name that no other process has, on another machine neither.
+    # A name that no process has, on this machine or another.
     unfinished = path.with_name(_unfinished(f"{uuid.uuid4().hex}-{path.name}"))
     try:
         yield unfinished
@@ -49,14 +52,14 @@ def _place(unfinished, path):
         unfinished.replace(path)
 
 
-def synced(path: Path):
-    """Wait until a file is on disk, whatever happens to the power then."""
+def synced(path: Path) -> None:
+    """Wait until a file is on disk, where a loss of power cannot damage it."""
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
 
 
-def remove_unfinished(folder: Path):
-    """Remove what this process was writing, where it is about to end."""
+def remove_unfinished(folder: Path) -> None:
+    """Remove the unfinished files of this process, which is about to end."""
     for path in folder.glob(_unfinished("*")):
         path.unlink(missing_ok=True)
 

@@ -38,7 +38,7 @@ def fit(
     *,
     optimiser: optx.AbstractLeastSquaresSolver | optax.GradientTransformation | None = None,
     steps: int | None = None,
-    tolerance: float = DEFAULT_TOLERANCE,
+    tolerance: int | float = DEFAULT_TOLERANCE,
     patience: int | None = None,
     mode: Mode | None = None,
     checkpoint: str | os.PathLike | None = None,

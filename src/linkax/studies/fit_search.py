@@ -133,7 +133,7 @@ def run_search(
     search: AbstractSearch,
     args: tuple,
     steps: int,
-    tolerance: float,
+    tolerance: int | float,
     patience: int | None,
     checkpoint: str | os.PathLike | None,
     progress: bool | None,

@@ -1,4 +1,4 @@
-"""Parameters of a user's function as one vector that may take any value."""
+"""Map parameters of a user's function to one vector without bounds, and back."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from linkax.model.numbers import is_finite, real, require
 from linkax.studies.parameters import AbstractParameter
@@ -15,22 +15,24 @@ from linkax.studies.progress import path_parts
 
 
 class FreeParameters(eqx.Module):
-    """Parameters as functions of a vector z without bounds, whose entries for plain numbers all start near one.
+    """Parameters as functions of a vector z without bounds, (p,).
 
-    - `leaves`: numbers, arrays, and parameters that are functions; `structure`: of the tree that they are leaves of.
-    - `scales`: of the free numbers of each leaf.
-    - `names`: of all numbers; `leaf_names`.
+    Plain numbers are in units of their start, so that their entries of z start at ±1, or at 0.
+
+    - `leaves`: arrays, and `AbstractParameter`s. `structure`: the pytree that they are leaves of.
+    - `scales`: units of the free numbers of each leaf.
+    - `names`: of all numbers. `leaf_names`: of the leaves.
     """
 
-    leaves: list
-    scales: list
+    leaves: list[Array | AbstractParameter]
+    scales: list[Array]
     structure: Any = eqx.field(static=True)
     names: list[str] = eqx.field(static=True)
     leaf_names: list[str] = eqx.field(static=True)
 
     @staticmethod
-    def of(params) -> "FreeParameters":
-        """Of a pytree of numbers, arrays and `Positive` and its like.
+    def of(params: Any) -> "FreeParameters":
+        """Read a pytree of numbers, arrays, `Positive`, `Bounded` and `PhysicalInertia`.
 
         **Raises:** `ValueError` for leaves that are no numbers, or not finite.
         """
@@ -41,44 +43,47 @@ class FreeParameters(eqx.Module):
         names = []
         for path, leaf in zip(paths, leaves, strict=True):
             _check(path, leaf)
-            for inner, part in jax.tree.leaves_with_path(leaf.value if _is_parameter(leaf) else leaf):
+            for inner, part in jax.tree.leaves_with_path(leaf.value if isinstance(leaf, AbstractParameter) else leaf):
                 names += _names((*path, *inner), jnp.shape(part))
-        leaves = [leaf if _is_parameter(leaf) else jnp.asarray(leaf, float) for leaf in leaves]
-        scales = [jnp.ones_like(leaf.free) if _is_parameter(leaf) else _magnitudes(leaf) for leaf in leaves]
-        return FreeParameters(leaves, scales, structure, names, [_names(path, ())[0] for path in paths])
+        leaves = [leaf if isinstance(leaf, AbstractParameter) else jnp.asarray(leaf, float) for leaf in leaves]
+        leaf_names = [_names(path, ())[0] for path in paths]
+        return FreeParameters(leaves, list(map(_scales, leaves)), structure, names, leaf_names)
 
     def _starts(self):
-        free = [leaf.free if _is_parameter(leaf) else leaf for leaf in self.leaves]
+        free = [leaf.free if isinstance(leaf, AbstractParameter) else leaf for leaf in self.leaves]
         return [value / scale for value, scale in zip(free, self.scales, strict=True)]
 
     @property
     def start(self) -> Float[Array, " p"]:
-        """z of the parameters as they were given."""
+        """z where the fit starts."""
         return ravel_pytree(self._starts())[0]
 
-    def params(self, z):
-        """What the user's function gets."""
-        values = [part * scale for part, scale in zip(ravel_pytree(self._starts())[1](z), self.scales, strict=True)]
-        found = [leaf.value_of(x) if _is_parameter(leaf) else x for leaf, x in zip(self.leaves, values, strict=True)]
-        return jax.tree.unflatten(self.structure, found)
+    def params(self, z: Float[Array, " p"]) -> Any:
+        """The argument of the user's function, at z."""
+        free = [part * scale for part, scale in zip(ravel_pytree(self._starts())[1](z), self.scales, strict=True)]
+        values = [
+            leaf.value_of(x) if isinstance(leaf, AbstractParameter) else x
+            for leaf, x in zip(self.leaves, free, strict=True)
+        ]
+        return jax.tree.unflatten(self.structure, values)
 
-    def vector(self, z):
-        """All numbers of `params`."""
+    def vector(self, z: Float[Array, " p"]) -> Float[Array, " n"]:
+        """All numbers of `params(z)`."""
         return ravel_pytree(self.params(z))[0]
 
     @property
     def free_names(self) -> list[str]:
-        """Of the entries of z: their numbers' own, or of the leaf whose numbers they make together."""
-        found, rest = [], list(self.names)
+        """Names of the entries of z: of one number each, or of a leaf whose numbers depend on several entries."""
+        names, later = [], list(self.names)
         for of_leaf, leaf, scale in zip(self.leaf_names, self.leaves, self.scales, strict=True):
             size = sum(jnp.size(x) for x in jax.tree.leaves(getattr(leaf, "value", leaf)))
-            own, rest = rest[:size], rest[size:]
-            found += own if size == scale.size else [of_leaf] * scale.size
-        return found
+            own, later = later[:size], later[size:]
+            names += own if size == scale.size else [of_leaf] * scale.size
+        return names
 
     @property
-    def apart(self) -> np.ndarray:
-        """For each of these numbers, whether it is a rising function of one entry of z alone."""
+    def apart(self) -> Bool[np.ndarray, " n"]:
+        """Whether each number of `vector` is a rising function of one entry of z alone."""
         sizes = [
             (sum(jnp.size(x) for x in jax.tree.leaves(getattr(leaf, "value", leaf))), scale.size)
             for leaf, scale in zip(self.leaves, self.scales, strict=True)
@@ -86,16 +91,19 @@ class FreeParameters(eqx.Module):
         return np.concatenate([np.full(numbers, numbers == free) for numbers, free in sizes])
 
 
-def _is_parameter(node):
+def _is_parameter(node) -> bool:
     return isinstance(node, AbstractParameter)
 
 
-def _magnitudes(values):
-    return jnp.where(values == 0.0, 1.0, jnp.abs(values))
+def _scales(leaf):
+    """Units of the free numbers of a leaf."""
+    if isinstance(leaf, AbstractParameter):
+        return jnp.ones_like(leaf.free)
+    return jnp.where(leaf == 0.0, 1.0, jnp.abs(leaf))
 
 
 def _check(path, leaf):
-    if _is_parameter(leaf):
+    if isinstance(leaf, AbstractParameter):
         return
     name = _names(path, ())[0]
     what = f"parameter {name!r}"

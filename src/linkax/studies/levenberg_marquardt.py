@@ -1,4 +1,4 @@
-"""The method of Levenberg and Marquardt, of parts of optimistix, with damping that knows no units."""
+"""The method of Levenberg and Marquardt, built on optimistix, with damping that does not depend on units."""
 
 from collections.abc import Callable
 
@@ -10,15 +10,15 @@ from linkax.studies.uncertainty import NO_INFLUENCE
 FIRST_DAMPING = 1e-2
 LEAST_DAMPING = 1e-12
 HIGHER, LOWER = 2.0, 5.0
-ENOUGH = 0.25  # of what a step promised to gain, for the next to be damped less
-NOTHING = 1e-2  # of rtol: what is not worth a step
+ENOUGH = 0.25  # gain of a step, relative to the predicted one, above which the next is damped less
+NOTHING = 1e-2  # gain that is not worth a step, relative to rtol
 
 
 class _ScaledDescent(optx.AbstractDescent):
-    """Steps damped by λ D², λ one over the size of the step; D: largest norms so far of the columns of J.
+    """Steps −(Jᵀ J + λ D²)⁻¹ Jᵀ r, with λ one over the step size, D the largest norms so far of the columns of J.
 
-    optimistix damps by λ alone, which for parameters and residuals of some magnitude is too much, for others nothing.
-    (Moré, The Levenberg-Marquardt algorithm, 1978, section 6, says why D must not fall.)
+    optimistix damps by λ alone, which is too much for parameters and residuals of some magnitudes, and nothing for
+    others. (Moré, The Levenberg-Marquardt algorithm, 1978, section 6, says why D must not fall.)
     """
 
     def init(self, y, f_info_struct):
@@ -28,7 +28,7 @@ class _ScaledDescent(optx.AbstractDescent):
     def query(self, y, f_info, state):
         slopes = f_info.jac.as_matrix()
         largest = jnp.maximum(state[-1], jnp.linalg.norm(slopes, axis=0))
-        # What has no influence but rounding does not move.
+        # Parameters without influence, whose slopes are rounding, stay as they are.
         matters = largest > NO_INFLUENCE * jnp.max(largest)
         sizes = jnp.where(matters, largest, 1.0)
         left, values, right = jnp.linalg.svd(jnp.where(matters, slopes / sizes, 0.0), full_matrices=False)
@@ -40,15 +40,15 @@ class _ScaledDescent(optx.AbstractDescent):
 
 
 class _DelayedDamping(optx.AbstractSearch):
-    """λ that rises slowly where a step fails and falls quickly where one succeeds.
+    """λ that rises slowly where a step fails, and falls quickly where one succeeds.
 
-    Transtrum, Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization, 2012:
-    along a narrow valley, where steps fail that are too long, this takes the fewest.
+    Along a narrow valley, where long steps fail, this takes the fewest steps (Transtrum, Sethna, Improvements to the
+    Levenberg-Marquardt algorithm for nonlinear least-squares minimization, 2012).
 
-    The state is λ, and whether no step from here can gain more than `rtol` of the loss.
+    The state is λ, and whether no further step can gain more than `rtol` of the loss.
     """
 
-    rtol: float
+    rtol: int | float
 
     def init(self, y, f_info_struct):
         return jnp.asarray(FIRST_DAMPING, y.dtype), jnp.zeros((), bool)
@@ -61,7 +61,7 @@ class _DelayedDamping(optx.AbstractSearch):
         accept = first_step | (gained > 0.0)
         less = jnp.where(gained > ENOUGH * expected, damping / LOWER, damping)
         changed = jnp.where(accept, less, damping * HIGHER)
-        # A step that fails though little was expected meets the noise of the function.
+        # A step that fails although little was expected shows the noise of the function.
         enough = jnp.where(gained > 0.0, NOTHING * self.rtol, self.rtol)
         idle = jnp.logical_not(first_step) & (expected <= enough * before)
         damping = jnp.maximum(jnp.where(first_step, damping, changed), LEAST_DAMPING)
@@ -69,20 +69,20 @@ class _DelayedDamping(optx.AbstractSearch):
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """`optimistix.LevenbergMarquardt`, but for its damping, how it changes, and when it ends.
+    """`optimistix.LevenbergMarquardt` with another damping, another rule to change it, and another end.
 
-    - `rtol`, `atol`: changes of parameters and residual at which it ends; also what a step must promise to gain,
-      relative to the loss, for it to go on where steps fail.
+    - `rtol`, `atol`: changes of parameters and residual at which it ends. Where steps fail, it also ends once the
+      predicted gain is below `rtol` times the loss.
     """
 
-    rtol: float
-    atol: float
+    rtol: int | float
+    atol: int | float
     norm: Callable
     descent: optx.AbstractDescent
     search: optx.AbstractSearch
     verbose: Callable
 
-    def __init__(self, rtol, atol):
+    def __init__(self, rtol: int | float, atol: int | float):
         self.rtol, self.atol = rtol, atol
         self.norm, self.verbose = optx.max_norm, _silent
         self.descent, self.search = _ScaledDescent(), _DelayedDamping(rtol)

@@ -1,37 +1,46 @@
-"""Parameters of a fit that stay where they make sense, by what they are functions of."""
+"""Parameters of a fit that stay physical, as functions of numbers without bounds."""
 
 import abc
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from linkax.model.bodies import inertia_tensor
 from linkax.model.numbers import is_finite, namespace, number, real, require
 
 
 class AbstractParameter(eqx.Module):
-    """A parameter as a function of numbers that may take any value."""
+    """A parameter as a function of free numbers, which may take any value. `value`: where the fit starts."""
+
+    value: eqx.AbstractVar[Any]
 
     @property
     @abc.abstractmethod
     def free(self) -> Float[Array, "..."]:
-        """The numbers of which the parameter is a function, at its value."""
+        """The free numbers at the parameter's value."""
 
     @abc.abstractmethod
-    def value_of(self, free):
-        """The parameter at other such numbers."""
+    def value_of(self, free: Float[Array, "..."]) -> Any:
+        """The parameter as a function of the free numbers."""
 
 
 class Positive(AbstractParameter):
-    """Numbers that stay positive: fitted by their logarithm. `value`: where the fit starts, any shape."""
+    """Numbers that stay positive, fitted by their logarithm.
+
+    **Arguments:** `value`: where the fit starts, of any shape.
+
+    **Raises:** `ValueError` for numbers that are not positive and finite.
+    """
 
     value: Float[Array, "..."]
 
-    def __init__(self, value):
+    def __init__(self, value: ArrayLike | Sequence):
         self.value = _checked("Positive", value, lambda value: value > 0.0, "must be positive")
 
     @property
@@ -43,13 +52,18 @@ class Positive(AbstractParameter):
 
 
 class Bounded(AbstractParameter):
-    """Numbers that stay between two bounds. `value`: where the fit starts, between them, any shape."""
+    """Numbers that stay between two bounds, fitted by the logit of their place between them.
+
+    **Arguments:** `value`: where the fit starts, of any shape. `lower`, `upper`: the bounds, one number each.
+
+    **Raises:** `ValueError` for numbers that are not between the bounds.
+    """
 
     value: Float[Array, "..."]
-    lower: Float[Array, ""]
-    upper: Float[Array, ""]
+    lower: Float[Array | np.ndarray, ""]
+    upper: Float[Array | np.ndarray, ""]
 
-    def __init__(self, value, lower, upper):
+    def __init__(self, value: ArrayLike | Sequence, lower: ArrayLike, upper: ArrayLike):
         self.lower, self.upper = (number(bound, (), "Bounded: bound") for bound in (lower, upper))
         inside = lambda value: (value > self.lower) & (value < self.upper)
         self.value = _checked("Bounded", value, inside, f"must lie between {lower} and {upper}")
@@ -63,41 +77,51 @@ class Bounded(AbstractParameter):
 
 
 class Inertia(NamedTuple):
-    """Mass [kg], centre of mass [m], (3,), and inertia tensor about it [kg m²], (3, 3), as `RigidBody` takes them."""
+    """Inertia of a rigid body, as `linkax.RigidBody` takes it.
 
-    mass: Float[Array, ""]
-    center_of_mass: Float[Array, "3"]
-    inertia: Float[Array, "3 3"]
+    - `mass` [kg]. `center_of_mass`: in the body's reference frame, (3,) [m].
+    - `inertia`: tensor about the centre of mass, (3, 3) [kg m²].
+    """
+
+    mass: Float[Array | np.ndarray, ""]
+    center_of_mass: Float[Array | np.ndarray, "3"]
+    inertia: Float[Array | np.ndarray, "3 3"]
 
 
 class PhysicalInertia(AbstractParameter):
     """The inertia of a body that can exist: some distribution of positive mass has it.
 
-    Fitted by the ten numbers of Rucker and Wensing, Smooth parameterization of rigid-body inertia, IEEE Robotics and
-    Automation Letters 7(2), 2022: the pseudo-inertia matrix is U Uᵀ, U upper triangular with a positive diagonal. The
-    function that is fitted gets an `Inertia`.
+    The fitted function gets an `Inertia`. It is fitted by the ten numbers of Rucker and Wensing, Smooth
+    parameterization of rigid-body inertia, IEEE Robotics and Automation Letters 7(2), 2022: the pseudo-inertia matrix
+    is U Uᵀ, where U is upper triangular with a positive diagonal.
 
-    **Arguments:** `mass`, `center_of_mass`, `inertia` as in `linkax.RigidBody`, where the fit starts: of a body with
-    extent along all axes.
+    **Arguments:** `mass`, `center_of_mass`, `inertia` as in `linkax.RigidBody`, where the fit starts.
+
+    **Raises:** `ValueError` for the inertia of a body that has no extent along some axis, or that cannot exist.
     """
 
     value: Inertia
 
-    def __init__(self, mass, center_of_mass=(0.0, 0.0, 0.0), inertia=(1.0, 1.0, 1.0)):
-        mass = number(mass, (), "PhysicalInertia: mass [kg]")
-        center_of_mass = number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]")
-        given, inertia = inertia, inertia_tensor(inertia, "PhysicalInertia: inertia [kg m²]")
-        smallest = _least(_pseudo_inertia(mass, center_of_mass, inertia))
+    def __init__(
+        self,
+        mass: ArrayLike,
+        center_of_mass: ArrayLike | Sequence = (0.0, 0.0, 0.0),
+        inertia: ArrayLike | Sequence = (1.0, 1.0, 1.0),
+    ):
+        m = number(mass, (), "PhysicalInertia: mass [kg]")
+        center = number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]")
+        tensor = inertia_tensor(inertia, "PhysicalInertia: inertia [kg m²]")
+        smallest = _least(_pseudo_inertia(m, center, tensor))
         remedy = (
-            f"no body with extent along all axes has it and inertia {given} kg m²; all principal moments must be "
+            f"no body with extent along all axes has it and inertia {inertia} kg m²; all principal moments must be "
             "positive, and each smaller than the sum of the other two"
         )
-        mass = require(mass, lambda _: smallest > 0.0, "PhysicalInertia: mass [kg]", remedy)
-        self.value = Inertia(mass, center_of_mass, inertia)
+        m = require(m, lambda _: smallest > 0.0, "PhysicalInertia: mass [kg]", remedy)
+        self.value = Inertia(m, center, tensor)
 
     @property
     def free(self):
-        # U Uᵀ from the Cholesky factor of the matrix with its rows and columns the other way round.
+        # U from the Cholesky factor of the matrix with the order of its rows and columns reversed.
         upper = jnp.linalg.cholesky(_pseudo_inertia(*self.value)[::-1, ::-1])[::-1, ::-1]
         size = upper[3, 3]
         u = upper / size
@@ -134,8 +158,11 @@ def _checked(kind, value, condition, remedy):
     return require(array, right, f"{kind}: value", f"it {remedy}, and be finite")
 
 
-def as_arrays(tree, what):
-    """A pytree with arrays in place of numbers and lists; `what` names it in errors."""
+def as_arrays(tree: Any, what: str) -> Any:
+    """A pytree with arrays in place of numbers; `what` names it in errors.
+
+    **Raises:** `ValueError` for a leaf that is no number.
+    """
 
     def array(path, leaf):
         try:

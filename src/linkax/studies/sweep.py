@@ -35,7 +35,7 @@ def sweep(
     params: Any,
     *,
     chunk: int | None = None,
-    memory: float = DEFAULT_MEMORY,
+    memory: int | float = DEFAULT_MEMORY,
     devices: Sequence[Any] | None = None,
     difficulty: Callable | ArrayLike | Sequence[float] | None = None,
     store: str | os.PathLike | None = None,
@@ -102,7 +102,7 @@ def sweep(
     return Sweep(output, reasons[back], seconds / ran if ran else float("nan"), remarks)
 
 
-def _check_sizes(chunk, memory: float):
+def _check_sizes(chunk, memory: int | float):
     """Raise a ValueError for a chunk or memory that is no positive number."""
     if chunk is not None:
         whole_number(chunk, "chunk")

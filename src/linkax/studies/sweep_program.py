@@ -40,7 +40,7 @@ class Program(NamedTuple):
         return 1 if _calls_lapack_for_batches(self.text) else _cores()
 
     @staticmethod
-    def compiled(function: Callable, one: Any, shape: Any, chunk: int, memory: float, devices: list) -> "Program":
+    def compiled(function: Callable, one: Any, shape: Any, chunk: int, memory: int | float, devices: list) -> "Program":
         """Compile for parameters of one member like `one`, and an output like `shape`, in no more than `memory`."""
         static = eqx.partition(shape, is_struct)[1]
         while True:

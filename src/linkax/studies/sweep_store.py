@@ -1,4 +1,4 @@
-"""Results of a sweep on disk, as they come."""
+"""Keep the results of a sweep on disk, chunk by chunk."""
 
 import contextlib
 import json
@@ -15,19 +15,25 @@ from zarr.storage import MemoryStore
 from linkax.studies.files import synced, writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
 from linkax.studies.progress import path_parts
+from linkax.studies.sweep_program import Program
 
 FORMAT = 2
-LABELLED = ("", "member", "reason", "done")  # these say in their attributes which sweep they are of
+LABELLED = ("", "member", "reason", "done")  # arrays whose attributes name the sweep
 LONGEST_NAME = 255  # bytes
-NUMBERS = tuple("biufc")  # kinds of them that Zarr has
+NUMBERS = tuple("biufc")  # kinds of numbers that Zarr has
 
 
 class SweepStore(NamedTuple):
-    """A Zarr group: `member`, the members in the order of rows; `reason`; `output/…`, one array for each of the
-    function's; `params/…`; and `done`, one number for each chunk, set once all of it is written: a checksum of it.
+    """A Zarr group with the results of a sweep.
 
-    Files can be damaged, and processes killed, or more than one at work. So what a sweep knows beforehand is written
-    anew wherever it is not there as it should be; of the rest only chunks count that match their checksums.
+    It holds `member`: the members in the order of rows; `reason`; `output/…`: one array for each of the function's;
+    `params/…`; and `done`: a checksum of each chunk, written once all of the chunk is.
+
+    Files can be damaged, and processes killed, or several at work. So all that a sweep knows beforehand is written
+    again wherever it is missing or wrong, and only chunks that match their checksums count as done.
+
+    - `sweep`: fingerprint of the program, the parameters and the order. `size`: members in a chunk.
+    - `done`, `arrays`: the array of checksums; `reason` and the outputs.
     """
 
     path: Path
@@ -37,8 +43,11 @@ class SweepStore(NamedTuple):
     arrays: tuple
 
     @staticmethod
-    def folder(path) -> Path:
-        """Where a store can be: a folder that may be written to, with nothing in it but perhaps a store."""
+    def folder(path: str | os.PathLike) -> Path:
+        """Make or check the folder of a store.
+
+        **Raises:** `ValueError` where it cannot be written to, or holds something else than a store.
+        """
         path = Path(os.fspath(path))
         writable_folder(path, f"give another store than {str(path)!r}")
         if not _is_free(path) and not _identities(path):
@@ -46,8 +55,8 @@ class SweepStore(NamedTuple):
         return path
 
     @staticmethod
-    def check(prefix, tree):
-        """Whether each leaf of a tree can be an array on disk."""
+    def check(prefix: str, tree: Any) -> None:
+        """Raise a ValueError where a leaf of a tree cannot be an array on disk."""
         names = _names(prefix, tree)
         for name, (path, leaf) in zip(names, jax.tree.leaves_with_path(tree), strict=True):
             what = f"store: {prefix}{jax.tree_util.keystr(path)}"
@@ -59,10 +68,10 @@ class SweepStore(NamedTuple):
                 raise ValueError(f"{what} has type {leaf.dtype}, unknown to Zarr; use float32 or int32, or no store")
 
     @staticmethod
-    def opened(path, program, params, order, not_run) -> "SweepStore":
-        """A new store, whose reasons are all `not_run`, or the one that is there.
+    def opened(path: Path, program: Program, params: Any, order: np.ndarray, not_run: int) -> "SweepStore":
+        """Open the store in a folder, or make a new one, whose reasons are all `not_run`.
 
-        **Raises:** `ValueError` where it holds another sweep.
+        **Raises:** `ValueError` where the folder holds another sweep.
         """
         sweep = fingerprint(program.text, [*jax.tree.leaves(params), order])
         identity = dict(format=FORMAT, members=len(order), chunk=program.size, sweep=sweep)
@@ -77,18 +86,18 @@ class SweepStore(NamedTuple):
             assert isinstance(done, zarr.Array)
             return SweepStore(path, sweep, program.size, done, arrays)
 
-    def load(self, found) -> set:
-        """Read what is there into (outputs, reasons); returns where the chunks begin that are done.
+    def load(self, results: tuple[Any, np.ndarray]) -> set[int]:
+        """Read the chunks that are done into (outputs, reasons), and return the row at which each begins.
 
-        **Warns:** of chunks that are damaged.
+        **Warns:** of damaged chunks.
         """
-        outputs, reasons = found
+        outputs, reasons = results
         whole, done, damaged = [reasons, *jax.tree.leaves(outputs)], set(), 0
         for start in range(0, len(reasons), self.size):
             part = slice(start, min(start + self.size, len(reasons)))
             try:
                 pieces = self._read(start, part)
-            except Exception:  # whatever a damaged file leads to
+            except Exception:  # a damaged file can raise anything
                 damaged += part.stop - part.start
                 continue
             if pieces is not None:
@@ -101,7 +110,10 @@ class SweepStore(NamedTuple):
         return done
 
     def _read(self, start, part):
-        """A chunk's arrays, or None where it is not done."""
+        """The arrays of a chunk, or None where it is not done.
+
+        **Raises:** `ValueError` where they do not match their checksum.
+        """
         checksum = self.done[start // self.size]
         if checksum == 0:
             return None
@@ -110,8 +122,8 @@ class SweepStore(NamedTuple):
             raise ValueError("these are not the numbers that were written")
         return pieces
 
-    def save(self, start, part, computed):
-        """Write a chunk, and then that it is done."""
+    def save(self, start: int, part: slice, computed: tuple[Any, np.ndarray]) -> None:
+        """Write the outputs and reasons of a chunk, and then its checksum."""
         outputs, reasons = computed
         pieces = [reasons, *jax.tree.leaves(outputs)]
         for array, piece in zip(self.arrays, pieces, strict=True):
@@ -125,29 +137,29 @@ class SweepStore(NamedTuple):
             synced(self.path / array.path / array.metadata.encode_chunk_key(chunk))
 
     def _checksum(self, start, pieces):
-        """Never zero, in practice: of a chunk's sweep, place and numbers."""
+        """A checksum of a chunk's sweep, place and numbers; in practice never zero."""
         return np.uint64(int(fingerprint(f"{self.sweep} {start}", pieces)[:16], 16))
 
 
 def _is_free(path) -> bool:
-    """Hidden files, such as those that are being written, do not count."""
+    """Whether a folder holds nothing but hidden files, such as unfinished ones."""
     return all(entry.name.startswith(".") for entry in path.iterdir())
 
 
 def _identities(path) -> list[dict]:
-    """Of which sweep the files of a store say that they are, as far as they can be read."""
-    found = []
+    """The identities of sweeps in the attributes of a store's files, as far as they can be read."""
+    identities = []
     for name in LABELLED:
         with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
             attributes = json.loads((path / name / "zarr.json").read_bytes())["attributes"]
-            found += [attributes] if attributes["sweep"] else []
-    return found
+            identities += [attributes] if attributes["sweep"] else []
+    return identities
 
 
 def _claim(path, identity, content):
-    """Make a folder that is free the store of a sweep; of processes that start at once, one does.
+    """Mark a free folder as the store of a sweep; of processes that start at once, one does.
 
-    **Raises:** `ValueError` where it is that of another.
+    **Raises:** `ValueError` where it is the store of another sweep.
     """
     if _is_free(path):
         with contextlib.suppress(FileExistsError), written_whole(path / "zarr.json", exclusive=True) as file:
@@ -162,7 +174,7 @@ def _claim(path, identity, content):
 
 
 def _known_files(identity, program, params, order, not_run) -> dict[str, bytes]:
-    """All that is in a store before a chunk is done, by where it is."""
+    """{path in the store: content} of all that a store holds before any chunk is done."""
     outputs, reason = program.outputs
     count, chunks = len(order), -(-len(order) // program.size)
     kept = {}
@@ -179,23 +191,23 @@ def _known_files(identity, program, params, order, not_run) -> dict[str, bytes]:
     for name, info in zip(_names("output", outputs), jax.tree.leaves(outputs), strict=True):
         add(name, info.dtype, np.nan if np.issubdtype(info.dtype, np.inexact) else 0, (count, *info.shape[1:]))
     add("done", np.uint64, 0, (chunks,), 1)
-    given = dict(zip(_names("params", params), jax.tree.leaves(params), strict=True)) | {"member": order}
-    for name, array in given.items():
+    inputs = dict(zip(_names("params", params), jax.tree.leaves(params), strict=True)) | {"member": order}
+    for name, array in inputs.items():
         add(name, array.dtype, 0, array.shape, count)[...] = np.asarray(array)
     return {key: value.to_bytes() for key, value in kept.items()}
 
 
 def _mend(path, files):
-    """Write what is not there, and what is there but not as it should be.
+    """Write files that are missing, or whose content is wrong.
 
-    **Warns:** of the latter.
+    **Warns:** of wrong ones.
     """
     damaged = []
     for name, content in files.items():
         file = path / name
         if file.is_file():
-            found = file.read_bytes()
-            if found == content or (file.name == "zarr.json" and _says(found, content)):
+            present = file.read_bytes()
+            if present == content or (file.name == "zarr.json" and _says(present, content)):
                 continue
             damaged.append(name)
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -205,27 +217,27 @@ def _mend(path, files):
         warnings.warn(f"store {str(path)!r}: not as written, and restored: {', '.join(damaged)}", stacklevel=4)
 
 
-def _says(found, content) -> bool:
-    """Whether a document of JSON has all that another has; others may have added to it."""
+def _says(present, content) -> bool:
+    """Whether a JSON document holds all entries of another, and perhaps more."""
     try:
-        return _holds(json.loads(found), json.loads(content))
+        return _holds(json.loads(present), json.loads(content))
     except ValueError:
         return False
 
 
-def _holds(found, wanted) -> bool:
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        return all(key in found and _holds(found[key], wanted[key]) for key in wanted)
-    return found == wanted
+def _holds(present, wanted) -> bool:
+    if isinstance(present, dict) and isinstance(wanted, dict):
+        return all(key in present and _holds(present[key], wanted[key]) for key in wanted)
+    return present == wanted
 
 
 def _can_be_a_name(part) -> bool:
-    """Of a folder, and of an array of Zarr."""
+    """Whether a part of a path can be the name of a folder, and of a Zarr array."""
     reserved = part in ("", ".", "..", "zarr.json") or part.startswith("__") or "\\" in part
     return part.isprintable() and not reserved and len(part.encode()) <= LONGEST_NAME
 
 
 def _names(prefix, tree: Any) -> list[str]:
-    """Paths of a tree's leaves as names of arrays."""
+    """Names of arrays for a tree's leaves, by their paths."""
     paths = [path for path, _ in jax.tree.leaves_with_path(tree)]
     return ["/".join([prefix, *path_parts(path)]) if path else f"{prefix}/value" for path in paths]

@@ -1,37 +1,41 @@
-"""How sure parameters are that measurements gave."""
+"""Estimate the uncertainty of fitted parameters."""
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
 from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.studies.free_parameters import FreeParameters
 
-NO_INFLUENCE = 1e-10  # of a parameter, relative to that of the most influential
-DEPENDENT = 1e-8  # smallest to largest diagonal of R: what rounding leaves of derivatives
-INVOLVED = 1e-3  # share of a parameter in a change that the data do not see
+NO_INFLUENCE = 1e-10  # sensitivity of a parameter, relative to the largest, up to which it has no influence
+DEPENDENT = 1e-8  # diagonal entry of R, relative to the largest, up to which it is rounding of the derivatives
+INVOLVED = 1e-3  # part of a parameter in a change that the data do not see, up to which it is not involved
 
 
 class Uncertainty(NamedTuple):
-    """Covariance of all parameters, and what cannot be told of them.
+    """Covariance of all parameters, and the names of those that the data do not determine.
 
     - `covariance`, `noise`, `undetermined`: see `linkax.Fit`.
-    - `spread`: level of confidence -> ends of the intervals, in the structure of the parameters.
+    - `spread`: level of confidence -> (lower, upper) ends of the intervals, in the structure of the parameters.
     """
 
-    covariance: np.ndarray
+    covariance: Float[np.ndarray, "n n"]
     noise: float
     undetermined: list[str]
-    spread: Callable
+    spread: Callable[[float], tuple[Any, Any]]
 
 
-def uncertainty(residual, slopes, free, z) -> Uncertainty:
-    """Covariance of the parameters from the sensitivities (n, p) of the residual, by their column-pivoted QR."""
+def uncertainty(
+    residual: Float[np.ndarray, " n"], slopes: Float[np.ndarray, "n p"], free: FreeParameters, z: Float[Array, " p"]
+) -> Uncertainty:
+    """Estimate the covariance of the parameters at z, by column-pivoted QR of the residual's sensitivities `slopes`."""
     count, size = slopes.shape
     norms = np.linalg.norm(slopes, axis=0)
     matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
@@ -46,7 +50,7 @@ def uncertainty(residual, slopes, free, z) -> Uncertainty:
     to_free[np.ix_(rows, rows)] = inverse @ inverse.T / np.outer(scale[rows], scale[rows])
     freedom = max(count - rank, 1)
     noise = float(np.sqrt(residual @ residual / freedom))
-    # Changes that the residual does not see: of one parameter that is left over, and what makes up for it.
+    # Changes that the residual does not see: of one dependent parameter, and of those that make up for it.
     unseen = np.zeros((size, size - rank))
     unseen[order[:rank]] = -inverse @ r[:rank, rank:]
     unseen[order[rank:]] = np.eye(size - rank)
@@ -55,7 +59,7 @@ def uncertainty(residual, slopes, free, z) -> Uncertainty:
     covariance = noise**2 * slopes_of_params @ to_free @ slopes_of_params.T
     depends = np.abs(slopes_of_params)
     depends = np.where(depends > NO_INFLUENCE * np.max(depends, axis=1, keepdims=True), slopes_of_params, 0.0)
-    # A number is free where what it depends on is, and does not cancel.
+    # A number is undetermined where the free numbers that it depends on are, and their changes do not cancel.
     each = np.abs(depends) @ np.where(np.abs(unseen) > INVOLVED, np.abs(unseen) / scale[:, None], 0.0)
     together = np.abs(depends @ (unseen / scale[:, None]))
     undetermined = np.any((each > 0.0) & (together > INVOLVED * each), axis=1)
@@ -66,7 +70,7 @@ def uncertainty(residual, slopes, free, z) -> Uncertainty:
 
 
 def _ends(free, z, covariance, deviation, freedom, level):
-    """Ends of the intervals, from Student's t distribution."""
+    """(lower, upper) ends of the intervals, from Student's t distribution."""
     _, unravel = ravel_pytree(free.params(z))
     times, ends = float(scipy.stats.t.ppf(0.5 + level / 2.0, freedom)), []
     for sign in (-1.0, 1.0):
