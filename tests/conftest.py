@@ -4,17 +4,20 @@ import sys
 import tempfile
 from pathlib import Path
 
+# The settings that users have, for tests marked users_settings.
+AS_USERS_DO = os.environ.get("AS_USERS_DO") == "1"
 # Tests spend their time on compiling, which these halve and more; they change how code is made, not what it computes.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true --xla_backend_optimization_level=0 "
-    "--xla_cpu_parallel_codegen_split_count=1 "
-    # Loops left as they are, see linkax.xla.flags; tests/test_compiler.py is for what users run.
-    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024",
-)
+if not AS_USERS_DO:
+    os.environ.setdefault(
+        "XLA_FLAGS",
+        "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true "
+        "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
+        # Loops left as they are, see linkax.xla.flags.
+        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024",
+    )
 # What one test file has compiled, in this process or another, the next one reads. Errors of Equinox as numbers that are
 # not finite: a program with a callback in it cannot be kept.
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+if not AS_USERS_DO and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _compiled = tempfile.TemporaryDirectory()  # removed with the process that made it, the others inherit its name
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": _compiled.name, "EQX_ON_ERROR": "nan"}
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
@@ -22,9 +25,9 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 # Programs without lines of source code in them: less to lower and to carry along.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
-import jax
-import pytest
-from hypothesis import Phase, settings
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from hypothesis import Phase, settings  # noqa: E402
 
 # The same examples in each run; `--hypothesis-profile thorough` takes many others, and makes failing ones small.
 _quick = [Phase.explicit, Phase.generate]
