@@ -1,4 +1,4 @@
-"""Pictures of a motion: time histories, and an animation."""
+"""Plot a motion: time histories, and an animation."""
 
 from linkax.plotting.animation import animate_mechanism as animate_mechanism
 from linkax.plotting.histories import plot_energy as plot_energy

@@ -1,4 +1,4 @@
-"""The figure of a comparison of formulations."""
+"""Plot a comparison of formulations."""
 
 from matplotlib.figure import Figure
 
@@ -8,13 +8,14 @@ from linkax.studies.comparison_result import Comparison
 
 COLOURS = (VERMILION, GREEN, ORANGE, PURPLE, SKY, INK, FAINT)
 MARKERS = {"": "o", "baumgarte": "s", "partitioning": "^", "projection": "D"}
-SMALLEST = 1e-16  # drawn in place of zero, which has no logarithm
+SMALLEST = 1e-16  # drawn in place of smaller errors: zero has no logarithm
 
 
 def plot_comparison(comparison: Comparison) -> Figure:
-    """Error of each formulation against its run time; several trials of one are joined.
+    """Plot the error [m] of each formulation against its run time [ms]; lines join the trials of one formulation.
 
-    A colour is a way to accelerations, a marker what is added to it; hollow markers have diverged.
+    Colours show the base of a formulation, markers what is added to it, such as Baumgarte's stabilisation. Trials with
+    hollow markers diverged.
     """
     figure = Figure(figsize=(9.0, 5.2), layout="constrained")
     panel = figure.subplots()

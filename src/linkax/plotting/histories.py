@@ -1,25 +1,28 @@
-"""Figures of what changes over time.
+"""Plot time histories.
 
-Made without pyplot, so that they need no display and leave no global state:
-`plot_energy(solution).savefig("energy.png")`, or the last value of a notebook cell.
+Figures are made without pyplot, so that they need no display and leave no global state. Save one by
+`plot_energy(solution).savefig("energy.png")`, or let it be the last value of a notebook cell.
 """
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from linkax.plotting.colours import BLUE, GREEN, INK, VERMILION
+from linkax.plotting.scenery import Place
 from linkax.simulation.read.solution import Solution
 
 COMPONENT_COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
-NEGLIGIBLE = 1e-9  # of the largest component
+NEGLIGIBLE = 1e-9  # size of a component, relative to the largest, up to which it is left out
 SMALLEST_VIOLATION = 1e-17  # drawn in place of zero, which has no logarithm
 
 
-def plot_point_motion(solution: Solution, body: str, at=None, name: str | None = None) -> Figure:
-    """Displacement [m], velocity [m/s] and acceleration [m/s²] of a point against time [s].
+def plot_point_motion(solution: Solution, body: str, at: Place = None, name: str | None = None) -> Figure:
+    """Plot displacement [m], velocity [m/s] and acceleration [m/s²] of a point against time [s], along ground axes.
 
-    The point is the body's centre of mass, or `at` on it (see `Solution.position`); `name` is
-    what the title calls it. Components along ground axes in which it stays at rest are left out.
+    Components in which the point does not move are left out.
+
+    **Arguments:** `body`, `at`: the point, see `Solution.position`. `name`: of the point, in the title; by default the
+    body's.
     """
     histories = {
         "displacement [m]": solution.position(body, at),
@@ -36,7 +39,7 @@ def plot_point_motion(solution: Solution, body: str, at=None, name: str | None =
 
 
 def plot_reaction(solution: Solution, joint: str) -> Figure:
-    """Force [N] of a joint on its child against time [s], along ground axes; zero components left out."""
+    """Plot the force [N] of a joint on its child against time [s], along ground axes; zero components are left out."""
     force = solution.reaction(joint).force
     child = solution.mechanism.joint(joint).child.body
     shown = _present(force)
@@ -48,7 +51,7 @@ def plot_reaction(solution: Solution, joint: str) -> Figure:
 
 
 def plot_violations(solution: Solution) -> Figure:
-    """Largest violation of the loop rows on position, velocity and acceleration level against time [s].
+    """Plot the largest violation of the loop rows, in positions, velocities and accelerations, against time [s].
 
     See `linkax.Violation` for the units. Zeros are drawn at 1e-17.
     """
@@ -64,7 +67,7 @@ def plot_violations(solution: Solution) -> Figure:
 
 
 def plot_energy(solution: Solution) -> Figure:
-    """Kinetic, potential and total energy [J], and below the change of the total, against time [s]."""
+    """Plot kinetic, potential and total energy [J], and below the change of the total, against time [s]."""
     kinetic, potential = np.asarray(solution.kinetic_energy()), np.asarray(solution.potential_energy())
     total = kinetic + potential
     figure, (energies, change) = _panels("Energy", 2)
@@ -91,7 +94,7 @@ def _panels(title, count):
 
 
 def _present(values):
-    """Names of the components that are not negligible; all of them where all are zero."""
+    """Names of the components that are not negligible; all names where all components are zero."""
     sizes = np.max(np.abs(np.asarray(values)), axis=0)
     present = [name for name, size in zip("xyz", sizes, strict=True) if size > NEGLIGIBLE * max(sizes)]
     return present or list("xyz")
@@ -104,7 +107,7 @@ def _draw_components(panel, times, values, names):
 
 
 def _along(names):
-    """Words for the title: with one component there, no legend is needed."""
+    """Words for the title where there is one component, and so no legend."""
     return f" along {names[0]}" if len(names) == 1 else ""
 
 

@@ -1,20 +1,21 @@
-"""All pictures of a run, as files."""
+"""Write all pictures of a run as files."""
 
 from pathlib import Path
 
 import numpy as np
 
 from linkax.plotting import animate_mechanism, plot_energy, plot_point_motion, plot_reaction, plot_violations
+from linkax.plotting.scenery import Points
 from linkax.simulation.read.solution import Solution
 from linkax.studies.files import written_whole
 
 
-def write_pictures(solution: Solution, points, folder: Path) -> list[Path]:
-    """Write the pictures of a run, of the times it reached, and return their paths.
+def write_pictures(solution: Solution, points: Points, folder: Path) -> list[Path]:
+    """Write the pictures of a run, of the times that it reached, and return their paths.
 
-    The motion of each named point (Fig. 8 of the paper for the crank-slider's slider),
-    violations (Fig. 10), the reaction of each joint on ground (Fig. 11 for its guide), energy,
-    and the animation `mechanism.gif`.
+    These are the motion of each named point (of the crank-slider's slider: Fig. 8 of the paper), the violations
+    (Fig. 10), the reaction of each joint on ground (of the guide: Fig. 11), the energy, and the animation
+    `mechanism.gif`.
     """
     figures = {f"motion_{name}": plot_point_motion(solution, body, at, name) for name, (body, at) in points.items()}
     figures |= {"violations": plot_violations(solution), "energy": plot_energy(solution)}
@@ -34,6 +35,7 @@ def write_pictures(solution: Solution, points, folder: Path) -> list[Path]:
 
 
 def _on_ground(mechanism) -> set[str]:
+    """Names of the joints on ground."""
     topology = mechanism.topology
     ends = zip(topology.joints, topology.parent, topology.child, strict=True)
     return {name for name, parent, child in ends if -1 in (parent, child)}
