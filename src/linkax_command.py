@@ -1,11 +1,11 @@
 """The command `linkax`, which hears Ctrl-C from its first moment, before linkax is imported.
 
-Python tells its main thread of a signal once the call that this is in returns, and XLA compiles and runs for minutes in
-one call. The KeyboardInterrupt that it raises then, anywhere, a callback may swallow, or it leaves XLA half way. So
-another thread hears the signal, and ends the process while the main thread rests.
+Python delivers a signal to its main thread only once the current call returns, and XLA compiles and runs for minutes in
+one call. The KeyboardInterrupt that Python raises then may be swallowed by a callback, or leave XLA half way. Here
+another thread hears the signal, and ends the process while the main thread sleeps.
 """
 
-import _thread  # `threading` and `socket` would take their time
+import _thread  # `threading` and `socket` take long to import
 import os
 import signal
 import time
@@ -13,12 +13,15 @@ from collections.abc import Callable
 
 INTERRUPTED = 128 + signal.SIGINT  # the exit code
 
-_ended = {}  # {"by": "interrupt" or "itself"}, whichever was first
-_keeping = {"last": lambda: ""}
+_ended: dict[str, str] = {}  # {"by": "interrupt" or "itself"}, whichever was first
+_keeping: dict[str, Callable[[], str]] = {"last": lambda: ""}
 
 
 def main() -> int:
-    """Run the command line; see `linkax.cli.main`. Ctrl-C ends it with one line and code 130, twice at once."""
+    """Run the command line, see `linkax.cli.main`.
+
+    Ctrl-C ends it with one line and code 130; a second Ctrl-C ends it at once.
+    """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not one that a shell keeps from background jobs
         _listen()
     try:
@@ -31,8 +34,8 @@ def main() -> int:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # while Python ends
 
 
-def at_interrupt(keep: Callable[[], str]):
-    """Have `keep` called at Ctrl-C, in another thread: it writes what has been computed, and says so in a few words."""
+def at_interrupt(keep: Callable[[], str]) -> None:
+    """Call `keep` at Ctrl-C, in another thread; it writes what has been computed, and returns where, in a few words."""
     _keeping["last"] = keep
 
 
@@ -46,6 +49,7 @@ def _listen():
 
 
 def _ends_by(what) -> bool:
+    """Whether `what` was first to end the process."""
     return _ended.setdefault("by", what) == what
 
 

@@ -1,8 +1,10 @@
-"""The commands, and the one line that bad input gets."""
+"""Parse and run the commands; bad input is answered by one line."""
 
 import argparse
 import sys
 import warnings
+from collections.abc import Sequence
+from typing import NoReturn
 
 import linkax as lx
 from linkax.cli import compare, simulate
@@ -10,20 +12,23 @@ from linkax.scenes import SCENES
 
 
 class _Parser(argparse.ArgumentParser):
-    """One line on what is wrong, and no dump of the usage."""
+    """A parser that tells an error in one line, without the usage."""
 
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see `{self.prog} --help`")
 
 
-def main(argv=None) -> int:
-    """Run the command line; returns the exit code: 0, 1 for a run that failed, 2 for bad input."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line, by default of this process.
+
+    **Returns:** the exit code: 0, 1 for a run that failed, 2 for bad input.
+    """
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: print(f"linkax: {message}", file=sys.stderr)
             arguments = _parser().parse_args(argv)
             return arguments.command(arguments)
-    except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
+    except BrokenPipeError:  # the reader of the output, such as `head`, has ended
         sys.stderr.close()
         return 0
     except lx.SimulationError as error:
@@ -44,12 +49,13 @@ def _parser():
     return parser
 
 
-def _list(arguments):
-    for found in SCENES.values():
-        print(f"{found.name}: {found.summary}")
-        for name, variant in found.variants.items():
-            default = " (default)" if name == found.default_variant else ""
+def _list(arguments) -> int:
+    """Print the scenes, their variants and parameters."""
+    for scene in SCENES.values():
+        print(f"{scene.name}: {scene.summary}")
+        for name, variant in scene.variants.items():
+            default = " (default)" if name == scene.default_variant else ""
             print(f"    variant {name}{default}: {variant.summary}")
-        for name, default in found.parameters.items():
-            print(f"    {name} = {default:g}: {found.meanings[name]}")
+        for name, default in scene.parameters.items():
+            print(f"    {name} = {default:g}: {scene.meanings[name]}")
     return 0

@@ -1,17 +1,18 @@
-"""What the commands share: options, how they are read, and a line on what happens now."""
+"""What the commands share: options, output folders, and a line that shows the progress."""
 
 import argparse
 import itertools
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any, SupportsFloat, cast
 
 import diffrax
 
 import linkax as lx
-from linkax.scenes import scene
+from linkax.scenes import Scene, scene
 from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.runge_kutta import RungeKutta4
 from linkax.studies.files import remove_unfinished, writable_folder, written_whole
@@ -22,8 +23,8 @@ OF_DIFFRAX = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno5")
 SOLVERS = {name.lower(): getattr(diffrax, name) for name in OF_DIFFRAX} | {"rk4": RungeKutta4}
 
 
-def add_run_options(parser):
-    """The scene, its parameters, and how it is integrated."""
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a run: the scene, its parameters, and how it is integrated."""
     parser.add_argument("scene", metavar="SCENE", help="a scene of `linkax list`")
     parser.add_argument("--variant", help="a variant of the scene (default: its first)")
     parser.add_argument("--t1", type=positive, metavar="S", help="end time [s]")
@@ -39,9 +40,25 @@ def add_run_options(parser):
 
 
 class RunOptions:
-    """What the options of `add_run_options` ask for."""
+    """The run that the options of `add_run_options` ask for.
 
-    def __init__(self, arguments):
+    - `scene`, `variant`, `parameters`: see `linkax.scenes.scene.Scene`.
+    - `t1`: end time [s]. `accuracy`, `solver`: see `linkax.simulate`.
+    - `points`: {name: (body, frame of the body or None for its centre of mass)}.
+    - `described`: all of it as JSON holds it.
+    """
+
+    scene: Scene
+    variant: str
+    parameters: dict[str, object]
+    t1: float
+    accuracy: lx.Accuracy
+    mechanism: lx.Mechanism
+    solver: diffrax.AbstractSolver
+    points: dict[str, tuple[str, str | None]]
+    described: dict[str, Any]
+
+    def __init__(self, arguments: argparse.Namespace):
         if arguments.solver == "rk4" and arguments.dt is None:
             raise ValueError("--solver rk4 estimates no error; give its steps by --dt")
         self.scene = scene(arguments.scene)
@@ -50,11 +67,10 @@ class RunOptions:
         self.t1 = self.scene.duration(self.variant) if arguments.t1 is None else arguments.t1
         self.accuracy = PRESETS[arguments.preset] if arguments.rtol is None else lx.Accuracy(rtol=arguments.rtol)
         self.mechanism = self.scene.mechanism(self.parameters)
-        asked = arguments.solver
-        if asked is None:
+        if arguments.solver is None:
             self.solver = default_solver(self.mechanism, None if arguments.dt else self.accuracy.rtol, self.t1)
         else:
-            self.solver = SOLVERS[asked]()
+            self.solver = SOLVERS[arguments.solver]()
         self.points = self.scene.points(self.parameters)
         self.display_name = {
             "scene": self.scene.name,
@@ -64,16 +80,20 @@ class RunOptions:
             "rtol": float(self.accuracy.rtol) if arguments.dt is None else None,
             "step": arguments.dt,
             "solver": next(name for name, kind in SOLVERS.items() if type(self.solver) is kind),
-            "parameters": {name: float(entry) for name, entry in self.parameters.items()},
+            "parameters": {name: float(cast(SupportsFloat, entry)) for name, entry in self.parameters.items()},
         }
 
-    def initial(self, mechanism):
-        """The start, assembled."""
+    def initial(self, mechanism: lx.Mechanism) -> lx.State:
+        """Assemble the initial state."""
         progress("assembling", None)
         return self.scene.initial(mechanism, self.parameters)
 
 
-def positive(text):
+def positive(text: str) -> float:
+    """Read a positive, finite number.
+
+    **Raises:** `ArgumentTypeError` for other text.
+    """
     try:
         number = float(text)
     except ValueError:
@@ -83,7 +103,9 @@ def positive(text):
     return number
 
 
-def one_of(choices):
+def one_of(choices: Iterable[str]) -> Callable[[str], str]:
+    """A function that reads one of several words, in any case, and raises `ArgumentTypeError` for others."""
+
     def read(text):
         if text.lower() not in choices:
             raise argparse.ArgumentTypeError(f"unknown {text!r}; known: {', '.join(choices)}")
@@ -92,29 +114,31 @@ def one_of(choices):
     return read
 
 
-def _path(text):
+def _path(text) -> Path:
     if not text:
         raise argparse.ArgumentTypeError("'' is no folder; give its name")
     return Path(text)
 
 
-def output_folder(asked: Path | None, prefix: str, settings: dict, files) -> Path:
-    """The folder asked for, or one under linkax-out that holds no results of other settings; tried before the run.
+def output_folder(asked: Path | None, prefix: str, settings: dict[str, Any], files: Iterable[str]) -> Path:
+    """The folder asked for, or one under linkax-out without results of other settings; checked before the run.
 
-    `files`: of JSON, that tell the settings of the results in a folder.
+    **Arguments:** `prefix`: of the default folder's name. `files`: JSON files with the settings of a folder's results.
+
+    **Raises:** `ValueError` for a folder that cannot be written to, or holds results of other settings.
     """
-    found = _free_folder(prefix, settings, files) if asked is None else asked
-    writable_folder(found, "give another by --out")
-    other = _other_setting(found, settings, files)
+    folder = _free_folder(prefix, settings, files) if asked is None else asked
+    writable_folder(folder, "give another by --out")
+    other = _other_setting(folder, settings, files)
     if other is None:
-        return found
+        return folder
     raise ValueError(
-        f"--out {str(found)!r} holds results of another run, {other}; give another folder, or remove this one"
+        f"--out {str(folder)!r} holds results of another run, {other}; give another folder, or remove this one"
     )
 
 
 def _free_folder(prefix, settings, files):
-    """linkax-out/SCENE, -VARIANT where that is not the default, or the first of SCENE-2, ... without other results."""
+    """linkax-out/SCENE, with -VARIANT where that is not the default, and -2, ... where others hold other results."""
     variant = settings["variant"]
     name = prefix + ("" if variant == scene(settings["scene"]).default_variant else f"-{variant}")
     names = itertools.chain([name], (f"{name}-{count}" for count in itertools.count(2)))
@@ -123,7 +147,7 @@ def _free_folder(prefix, settings, files):
 
 
 def _other_setting(folder, settings, files) -> str | None:
-    """How the results in a folder differ in what was asked for."""
+    """The first setting in which the results in a folder differ, in words, or None."""
     for path in map(folder.joinpath, files):
         try:
             kept = dict(json.loads(path.read_text()))
@@ -137,14 +161,14 @@ def _other_setting(folder, settings, files) -> str | None:
     return None
 
 
-def write_json(path: Path, described):
-    """Write a file of one JSON object."""
+def write_json(path: Path, described: dict[str, Any]) -> None:
+    """Write one JSON object to a file."""
     with written_whole(path) as unfinished:
         unfinished.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
 
 
-def at_interrupt_in(folder: Path, keep: Callable[[], str] = lambda: ""):
-    """Have Ctrl-C leave whole files alone in a folder, and `keep` what has been computed, see `at_interrupt`."""
+def at_interrupt_in(folder: Path, keep: Callable[[], str] = lambda: "") -> None:
+    """At Ctrl-C, remove unfinished files from a folder, and call `keep`, see `linkax_command.at_interrupt`."""
 
     def leave():
         remove_unfinished(folder)
@@ -153,7 +177,8 @@ def at_interrupt_in(folder: Path, keep: Callable[[], str] = lambda: ""):
     at_interrupt(leave)
 
 
-def _changes(assignments):
+def _changes(assignments) -> dict[str, str]:
+    """{name: value} of NAME=VALUE."""
     changes = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
@@ -163,8 +188,8 @@ def _changes(assignments):
     return changes
 
 
-def progress(phase, fraction):
-    """Tell a person what happens now; on one line where the terminal allows it."""
+def progress(phase: str, fraction: float | None) -> None:
+    """Show the current phase, and the fraction done where it is known; in a terminal on one line."""
     text = phase if fraction is None else f"{phase} {100 * fraction:.0f} %"
     if sys.stderr.isatty():
         print(f"\r{text:<60}", end="", file=sys.stderr, flush=True)
@@ -172,14 +197,14 @@ def progress(phase, fraction):
         print(f"{phase} ...", file=sys.stderr, flush=True)
 
 
-def end_progress():
-    """Clear the line on what happens now."""
+def end_progress() -> None:
+    """Clear the line that shows the progress."""
     if sys.stderr.isatty():
         print("\r" + 60 * " " + "\r", end="", file=sys.stderr)
 
 
-def steps_in_words(described) -> str:
-    """How the run steps, for people."""
+def steps_in_words(described: dict[str, Any]) -> str:
+    """How a run steps, in words."""
     if described["step"] is not None:
         return f"fixed steps of {described['step']:g} s"
     preset = "" if described["preset"] is None else f"{described['preset']}, "

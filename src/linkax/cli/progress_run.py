@@ -1,13 +1,15 @@
-"""A long run in segments, so that its progress can be reported from the host."""
+"""Run a long simulation in segments, to report its progress and to keep what it has computed."""
 
 import dataclasses
 import itertools
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from linkax.formulations.formulation import AbstractFormulation
@@ -23,15 +25,16 @@ from linkax.simulation.start.state import State
 
 SEGMENTS = 20
 DEFAULT_INTERVALS = 1000
-LONG_RUN = 2.0  # seconds
-WORTH_OPTIMISING = 4.0  # times the time to compile: a run that would take longer
-INSTANT = 1e-6  # of the whole time
+LONG_RUN = 2.0  # a run that would take longer is cut into segments [s]
+WORTH_OPTIMISING = 4.0  # run time, relative to compile time, above which the program is optimised
+INSTANT = 1e-6  # duration of the run that compiles, relative to the whole
 
 
 class TimedRun(NamedTuple):
-    """A solution, the wall time that compiling and running took [s], and whether its program was optimised.
+    """A solution, and how long it took.
 
-    See `linkax.simulate`: with beams it always is.
+    - `compile_s`, `run_s`: wall time of compiling and of running [s].
+    - `optimised`: whether the program was optimised, see `linkax.simulate`; with beams it always is.
     """
 
     solution: Solution
@@ -44,55 +47,34 @@ def simulate_in_segments(
     mechanism: Mechanism,
     state: State,
     *,
-    t1: float,
+    t1: int | float,
     accuracy: Accuracy = BALANCED,
     solver: diffrax.AbstractSolver | None = None,
     formulation: str | AbstractFormulation = DEFAULT_FORMULATION,
-    step: float | None = None,
+    step: int | float | None = None,
     intervals: int = DEFAULT_INTERVALS,
     report: Callable[[str, float | None], None] = lambda phase, fraction: None,
     keep: Callable[[Solution], None] = lambda solution: None,
 ) -> TimedRun:
-    """Integrate from 0 to t1 [s], and tell how far it is.
+    """Integrate from 0 to t1 [s], and report the progress.
 
-    A run that takes long is cut into segments, each with a few steps more than an uncut run
-    needs. The first one tells whether that is worth it, and whether it is to optimise the program,
-    which all others share.
+    A long run is cut into segments, each of which takes a few steps more than the same part of an uncut run. The first
+    segment shows whether that is worth it, and whether the program, which all segments share, is worth optimising.
 
     **Arguments:**
 
     - `mechanism`, `state`, `accuracy`, `solver`, `formulation`: see `linkax.simulate`.
-    - `step`: of fixed size [s], instead of steps that adapt.
-    - `intervals`: between the saved times, a multiple of 20.
-    - `report`: called with what happens now, and with the fraction done where that is known.
+    - `step`: size of fixed steps [s], in place of adaptive ones.
+    - `intervals`: number of intervals between the saved times, a multiple of 20.
+    - `report`: called with the current phase, and with the fraction done where that is known.
     - `keep`: called with the solution so far, after each segment.
 
-    **Returns:** a `TimedRun`; its solution ends with the segment that failed, if one did.
+    **Returns:** a `TimedRun`. If a segment fails, its solution ends with that segment.
     """
-
-    segment = intervals // SEGMENTS
     if solver is None:  # one for all parts
         solver = default_solver(mechanism, None if step else accuracy.rtol, t1)
-
-    def run(start, t0, end, optimise, count=segment):
-        """A part of the run, saved after `count` intervals; all such share a program."""
-        began = time.perf_counter()
-        times = np.pad(np.linspace(t0, end, count + 1), (0, intervals - count), mode="edge")
-        found = simulate(
-            mechanism,
-            start,
-            t0=t0,
-            t1=end,
-            accuracy=accuracy,
-            solver=solver,
-            formulation=formulation,
-            saveat=diffrax.SaveAt(ts=times),
-            optimise=optimise,
-            throw=False,
-            **fixed_steps(step, t1),
-        )
-        return jax.block_until_ready(found), time.perf_counter() - began
-
+    options = dict(accuracy=accuracy, solver=solver, formulation=formulation, **fixed_steps(step, t1))
+    run = partial(_timed, mechanism, intervals, options)
     report("compiling", None)
     optimised = bool(mechanism.beams)
     _, compile_s = run(state, 0.0, INSTANT * t1, optimised)
@@ -103,22 +85,41 @@ def simulate_in_segments(
         optimised, (_, seconds) = True, run(state, 0.0, INSTANT * t1, True)
         compile_s += seconds
         report("integrating", 1.0 / SEGMENTS)
-    # A classical formulation keeps what it leaves open: a segment would begin on the loops again.
-    if not isinstance(first.formulation, TangentSpace) or not _is_long(first, run_s):
-        whole, run_s = run(state, 0.0, t1, optimised, intervals)
-        keep(whole)
-        return TimedRun(whole, compile_s, run_s, optimised)
-    parts, whole = [first], _joined([first])
+    # A classical formulation keeps the gaps that it has left; a segment would begin with closed loops.
+    if isinstance(first.formulation, TangentSpace) and _is_long(first, run_s):
+        whole, seconds = _with_later_segments(run, first, t1, optimised, report, keep)
+        return TimedRun(whole, compile_s, run_s + seconds, optimised)
+    whole, run_s = run(state, 0.0, t1, optimised, intervals)
+    keep(whole)
+    return TimedRun(whole, compile_s, run_s, optimised)
+
+
+def _timed(mechanism, intervals, options, start, t0, end, optimise, count=None) -> tuple[Solution, float]:
+    """A part of the run, saved after `count` intervals, by default those of a segment, and its wall time [s].
+
+    All parts have equally many saved times, and so share a program.
+    """
+    count = intervals // SEGMENTS if count is None else count
+    began = time.perf_counter()
+    times = np.pad(np.linspace(t0, end, count + 1), (0, intervals - count), mode="edge")
+    saveat = diffrax.SaveAt(ts=jnp.asarray(times))
+    solution = simulate(mechanism, start, t0=t0, t1=end, saveat=saveat, optimise=optimise, throw=False, **options)
+    return jax.block_until_ready(solution), time.perf_counter() - began
+
+
+def _with_later_segments(run, first, t1, optimised, report, keep) -> tuple[Solution, float]:
+    """The solution of all segments, from that of the first, and the wall time of the later ones [s]."""
+    parts, whole, total = [first], _joined([first]), 0.0
     keep(whole)
     for t0, end in itertools.pairwise(np.linspace(0.0, t1, SEGMENTS + 1)[1:]):
         if whole.result != RESULTS.successful:
             break
         report("integrating", float(t0 / t1))
         part, seconds = run(whole.end, t0, end, optimised)
-        parts, run_s = [*parts, part], run_s + seconds
+        parts, total = [*parts, part], total + seconds
         whole = _joined(parts)
         keep(whole)
-    return TimedRun(whole, compile_s, run_s, optimised)
+    return whole, total
 
 
 def _is_long(first, seconds):
@@ -126,7 +127,7 @@ def _is_long(first, seconds):
 
 
 def _joined(parts) -> Solution:
-    """One solution with as many times as a run without segments; a border belongs to the earlier one."""
+    """One solution with as many times as a run without segments; the time between two belongs to the earlier one."""
     counted = {name: sum(part.stats[name] for part in parts) for name in parts[0].stats if name != "max_steps"}
     return dataclasses.replace(
         parts[-1],
@@ -141,14 +142,14 @@ def _joined(parts) -> Solution:
 
 
 def _mean_distance(parts):
-    """Over the time of all parts, from a singular configuration."""
+    """Mean distance from a singular configuration over the time of all parts."""
     lasting = [part for part in parts if part.t_end > part.ts[0]]
     durations = [part.t_end - part.ts[0] for part in lasting]
     return np.average([part.average for part in lasting], weights=durations) if lasting else parts[0].average
 
 
 def _one_after_another(parts):
-    """What each saved; the first times of the others are the last ones of those before."""
+    """Join what the parts saved; each later one begins with the last time of the one before."""
     saved = (len(parts[0]) - 1) // SEGMENTS
     first, *others = (np.asarray(part) for part in parts)
     return np.concatenate([first[: saved + 1], *(values[1 : saved + 1] for values in others)])

@@ -1,20 +1,29 @@
-"""A run in numbers: what is printed of it, and what is kept."""
+"""Summarise a run in numbers, and collect its trajectory."""
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from jaxtyping import ArrayLike
 
 from linkax.cli.progress_run import TimedRun
 from linkax.simulation.integrate.results import RESULTS, result_name
 from linkax.simulation.read.solution import Solution
 
+Points = Mapping[str, tuple[str, str | None]]
 
-def summary(run: TimedRun, points) -> dict:
-    """Steps, times, violations, energy error, rank, passages, result and final positions of a run.
 
-    Violations are relative (`Solution.worst_violation`); `energy_error` is the largest change of
-    the energy over the largest kinetic energy, or in joules where nothing moves: an error only
-    where no drive, damping or force of time adds or takes any. Of singular configurations: the
-    smallest distance at a saved time, the times of passages [s], and the digits that they cost
-    (`Solution.passages`). What is not finite, or not measured, is None.
+def summary(run: TimedRun, points: Points) -> dict[str, Any]:
+    """Steps, times, violations, energy error, rank, passages, result and final positions of a run, as JSON holds them.
+
+    - Violations are relative, see `Solution.worst_violation`.
+    - `energy_error`: largest change of the energy, relative to the largest kinetic energy; in joules where nothing
+      moves. It is an error only where no drive, damping or force that depends on time changes the energy.
+    - `singularity_distance`: the smallest at a saved time. `passages`: times through singular configurations [s].
+      `digits_lost`: in these, see `Solution.passages`.
+    - Numbers that are not finite, or not measured, are None.
+
+    **Arguments:** `points`: {name: (body, frame of the body or None for its centre of mass)}.
     """
     solution = run.solution
     reached = np.isfinite(np.asarray(solution.ts))
@@ -49,13 +58,14 @@ def summary(run: TimedRun, points) -> dict:
     }
 
 
-def finite(number):
-    """A number for JSON, which has no infinity: None in place of what is not finite."""
-    return float(number) if np.isfinite(number) else None
+def finite(number: ArrayLike) -> float | None:
+    """A number as JSON holds it, which has no infinity: None where it is not finite."""
+    value = float(np.asarray(number))
+    return value if np.isfinite(value) else None
 
 
-def trajectory(solution: Solution, points) -> dict[str, np.ndarray]:
-    """Arrays for an NPZ file, times first, SI units, ground axes.
+def trajectory(solution: Solution, points: Points) -> dict[str, np.ndarray]:
+    """Arrays for an NPZ file, with times as the first axis, in SI units and ground axes.
 
     - `t`, `q`, `v`, `coordinates`, `speeds`: see `states`; `energy`; `rank`; `position_violation`,
       `velocity_violation`, `acceleration_violation` as in `linkax.Violation`.
@@ -74,12 +84,13 @@ def trajectory(solution: Solution, points) -> dict[str, np.ndarray]:
 
 
 def states(solution: Solution) -> dict[str, np.ndarray]:
-    """What of a trajectory compiles nothing.
+    """The arrays of a trajectory that need no further compilation.
 
-    `t`; `q` and `coordinates`, `v` and `speeds`: coordinates and speeds of the tree's joints, and whose each is.
+    - `t`: times, (n_t,) [s]. `q`, `v`: coordinates and speeds of the tree's joints, (n_t, n_q) and (n_t, n_v).
+    - `coordinates`, `speeds`: the joint of each column of `q` and `v`.
     """
     topology = solution.mechanism.topology
-    owners = lambda slices: [name for name, taken in slices.items() for _ in range(taken.stop - taken.start)]
+    owners = lambda slices: [name for name, columns in slices.items() for _ in range(columns.stop - columns.start)]
     kept = {"t": solution.ts, "q": solution.q, "v": solution.v}
     kept |= {"coordinates": owners(topology.coordinates), "speeds": owners(topology.speeds)}
     return {name: np.asarray(values) for name, values in kept.items()}

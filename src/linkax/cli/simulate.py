@@ -1,7 +1,10 @@
-"""`linkax simulate SCENE`: one run, its trajectory and its pictures."""
+"""The command `linkax simulate SCENE`, which writes the trajectory and the pictures of one run."""
 
 import json
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,31 +22,32 @@ from linkax.cli.progress_run import simulate_in_segments
 from linkax.cli.report import states, summary, trajectory
 from linkax.formulations.named import TANGENT_SPACE, formulation
 from linkax.simulation.explain.diagnosis import cause
+from linkax.simulation.read.solution import Solution
 from linkax.studies.files import written_whole
 
 INTERVALS = 1000
-SHOWN = 5
+SHOWN = 5  # times of passages that are printed
 PART = ("trajectory-interrupted.npz", "summary-interrupted.json")
-WORTH_TELLING = 0.05  # distance from a singular configuration
+WORTH_TELLING = 0.05  # distance from a singular configuration below which it is printed
 
 
-def add_command(commands):
-    """Add the command to the parser."""
+def add_command(commands: Any) -> None:
+    """Add the command to a parser's subparsers."""
     parser = commands.add_parser("simulate", help="simulate a scene and write its trajectory and pictures")
     parser.set_defaults(command=_simulate)
     add_run_options(parser)
     parser.add_argument("--formulation", default=TANGENT_SPACE, metavar="NAME", help="see `linkax compare --help`")
 
 
-def _simulate(arguments):
+def _simulate(arguments) -> int:
+    """Simulate, write the files, print a summary, and return the exit code."""
     asked, chosen = RunOptions(arguments), formulation(arguments.formulation)
     settings = asked.display_name | {"formulation": arguments.formulation}
     out = output_folder(arguments.out, asked.scene.name, settings, ("summary.json", PART[1]))
     at_interrupt_in(out)
-    state = asked.initial(asked.mechanism)
     run = simulate_in_segments(
         asked.mechanism,
-        state,
+        asked.initial(asked.mechanism),
         t1=asked.t1,
         accuracy=asked.accuracy,
         solver=asked.solver,
@@ -54,10 +58,11 @@ def _simulate(arguments):
         keep=lambda solution: at_interrupt_in(out, keeping(out, settings, solution)),
     )
     progress("reading results", None)
-    found = settings | summary(run, asked.points)
+    described = settings | summary(run, asked.points)
+    arrays: dict[str, Any] = {**trajectory(run.solution, asked.points)}
     with written_whole(out / "trajectory.npz") as path:
-        np.savez(path, **trajectory(run.solution, asked.points))
-    write_json(out / "summary.json", found)
+        np.savez(path, **arrays)
+    write_json(out / "summary.json", described)
     files = [out / "trajectory.npz", out / "summary.json"]
     at_interrupt_in(out, lambda: f"the results are in {out}")
     for name in PART:
@@ -68,17 +73,18 @@ def _simulate(arguments):
 
         files += write_pictures(run.solution, asked.points, out)
     end_progress()
-    print(json.dumps(found, allow_nan=False) if arguments.json else _for_people(found, files))
-    if found["result"] == "successful":
+    print(json.dumps(described, allow_nan=False) if arguments.json else _for_people(described, files))
+    if described["result"] == "successful":
         return 0
-    stopped = f"the run stopped at t = {found['t_end']:.6g} s: {found['message']}{cause(run.solution)}"
+    stopped = f"the run stopped at t = {described['t_end']:.6g} s: {described['message']}{cause(run.solution)}"
     print(f"linkax: {stopped}", file=sys.stderr)
     return 1
 
 
-def keeping(out, settings, solution):
-    """What writes the motion of an interrupted run, apart from the results of a whole one."""
-    reached, t_end = states(solution), float(solution.t_end)
+def keeping(out: Path, settings: dict[str, Any], solution: Solution) -> Callable[[], str]:
+    """A function that writes the motion of an interrupted run, to other files than a whole one, and tells where."""
+    reached: dict[str, Any] = {**states(solution)}
+    t_end = float(solution.t_end)
 
     def keep():
         with written_whole(out / PART[0]) as path:
@@ -89,36 +95,37 @@ def keeping(out, settings, solution):
     return keep
 
 
-def _for_people(found, files):
-    final = [f"  {name:<22}{', '.join(f'{part:.9g}' for part in place)} m" for name, place in found["final"].items()]
+def _for_people(run, files) -> str:
+    """The summary in words."""
+    final = [f"  {name:<22}{', '.join(f'{part:.9g}' for part in place)} m" for name, place in run["final"].items()]
     lines = [
-        f"{found['scene']} {found['variant']}, {found['t1']:g} s, {found['formulation']}, {found['solver']}, "
-        + steps_in_words(found),
-        f"  result                {found['result']}",
-        f"  steps                 {found['steps']} ({found['rejected_steps']} of them rejected)",
-        f"  compile time          {found['compile_s']:.2f} s",
-        f"  run time              {1e3 * found['run_s']:.1f} ms{'' if found['optimised'] else ', not optimised'}",
-        f"  position violation    {found['position_violation']:.1e} of the loop's length",
-        f"  velocity violation    {found['velocity_violation']:.1e} of the largest speed",
-        f"  acceleration violation {found['acceleration_violation']:.1e} of the largest acceleration",
-        f"  energy change         {found['energy_error']:.1e} of the largest kinetic energy",
-        f"  independent loop rows {found['rank_min']} to {found['rank_max']}",
-        *_of_singular_configurations(found),
+        f"{run['scene']} {run['variant']}, {run['t1']:g} s, {run['formulation']}, {run['solver']}, "
+        + steps_in_words(run),
+        f"  result                {run['result']}",
+        f"  steps                 {run['steps']} ({run['rejected_steps']} of them rejected)",
+        f"  compile time          {run['compile_s']:.2f} s",
+        f"  run time              {1e3 * run['run_s']:.1f} ms{'' if run['optimised'] else ', not optimised'}",
+        f"  position violation    {run['position_violation']:.1e} of the loop's length",
+        f"  velocity violation    {run['velocity_violation']:.1e} of the largest speed",
+        f"  acceleration violation {run['acceleration_violation']:.1e} of the largest acceleration",
+        f"  energy change         {run['energy_error']:.1e} of the largest kinetic energy",
+        f"  independent loop rows {run['rank_min']} to {run['rank_max']}",
+        *_of_singular_configurations(run),
         *final,
         "written: " + ", ".join(map(str, files)),
     ]
     return "\n".join(lines)
 
 
-def _of_singular_configurations(found):
-    """Lines on singular configurations, where the run came close to one."""
+def _of_singular_configurations(run):
+    """Lines on singular configurations, where the run came near one."""
     lines = []
-    if found["passages"]:
-        count, times = len(found["passages"]), ", ".join(f"{time:.6g}" for time in found["passages"][:SHOWN])
+    if run["passages"]:
+        count, times = len(run["passages"]), ", ".join(f"{time:.6g}" for time in run["passages"][:SHOWN])
         more = "" if count <= SHOWN else ", ..."
         lines.append(f"  singular passages     {count}, at {times}{more} s")
-    elif found["singularity_distance"] < WORTH_TELLING:
-        lines.append(f"  singular configuration as near as {found['singularity_distance']:.1e} (1 is far)")
-    if lines and found["digits_lost"] is not None:
-        lines.append(f"  digits lost to that   {found['digits_lost']:.1f} of 16")
+    elif run["singularity_distance"] < WORTH_TELLING:
+        lines.append(f"  singular configuration as near as {run['singularity_distance']:.1e} (1 is far)")
+    if lines and run["digits_lost"] is not None:
+        lines.append(f"  digits lost to that   {run['digits_lost']:.1f} of 16")
     return lines

@@ -57,7 +57,7 @@ def compare(
     t1: int | float,
     steppings: Sequence[Stepping],
     formulations: Mapping[str, AbstractFormulation] | Sequence[str] = COMPARED,
-    exact: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None = None,
+    exact: Callable[[np.ndarray], Mapping[str, np.ndarray] | None] | None = None,
     bound: int | float | None = None,
     repeats: int = 3,
     report: Callable[[str, float | None], None] = lambda phase, fraction: None,
