@@ -1,4 +1,4 @@
-"""What forces and constraints have in common: joints that they act along, frames that they attach to."""
+"""What forces and constraints share: the joints that they act along, the frames that they attach to."""
 
 import abc
 from typing import Any
@@ -19,7 +19,7 @@ class AbstractElement(eqx.Module):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """Speeds of joints that this element acts along; those joints go into the spanning tree where they can."""
+        """Speeds that this element acts along. Their joints go into the spanning tree where they can."""
         return ()
 
     @property
@@ -35,4 +35,4 @@ class AbstractElement(eqx.Module):
     @property
     @abc.abstractmethod
     def display_name(self) -> str:
-        """What errors call it."""
+        """Name of this element in errors."""

@@ -1,4 +1,4 @@
-"""Functions that users hand to a mechanism: laws of drives and forces."""
+"""Functions that users give to a mechanism: laws of drives and forces."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -19,7 +19,7 @@ Numbers = TypeVar("Numbers", bound=Array | np.floating)
 class Function(eqx.Module):
     """A user's function as a pytree: its numbers are leaves, the rest is structure (see `Code`).
 
-    Both are those of the moment when this is made.
+    Both are taken when this is made, and do not follow later changes.
     """
 
     numbers: tuple[jax.Array, ...]
@@ -33,7 +33,7 @@ class Function(eqx.Module):
 
 
 class Law(eqx.Module):
-    """A user's function as part of a mechanism; `what` names it in errors."""
+    """A user's function in a mechanism, which returns numbers of a given shape; `what` names it in errors."""
 
     function: Function
     shape: tuple[int, ...] = eqx.field(static=True)
@@ -43,7 +43,7 @@ class Law(eqx.Module):
         self.function, self.shape, self.what = Function(function), shape, what
 
     def check(self) -> None:
-        """Whether what the function reads is what it was when the mechanism was built."""
+        """Raise a `ValueError` where what the function reads has changed since the mechanism was built."""
         if self.function.code.has_changed():
             variables = ", ".join(self.function.code.variables)
             raise ValueError(
@@ -65,24 +65,24 @@ class Law(eqx.Module):
 
 
 def raised(error: Exception) -> str:
-    """What a user's function raised, and what it is often due to."""
+    """Describe what a user's function raised, and what often helps."""
     first, *_ = str(error).split("\n")
     remedy = "make it of operations of jax.numpy, with jnp.where in place of if"
     return f"{type(error).__name__}: {first}; JAX traces it, so {remedy}"
 
 
 def number_or_law(entry: Any, shape: tuple[int, ...], what: str) -> Array | Law:
-    """A traced number of the given shape, or a function that returns one."""
+    """Read a number, or an array of the given shape, or a function that returns one."""
     return Law(entry, shape, what) if callable(entry) else number(entry, shape, what)
 
 
 def evaluated(entry: Numbers | Law, *arguments: Any) -> Numbers | jax.Array:
-    """A number, or what a `Law` says."""
+    """Return a number, or what a `Law` returns for these arguments."""
     return entry(*arguments) if isinstance(entry, Law) else entry
 
 
 def held_unless(law: Law, t: Number, moves: Any) -> Callable[..., Any]:
-    """A function of time as it is where `moves`; elsewhere as it is at time t for ever."""
+    """Return a function of time that goes on where `moves`, and elsewhere keeps its value at time t."""
     return jax.tree_util.Partial(_held_unless, law, t, moves)
 
 

@@ -1,7 +1,7 @@
 """Numbers of a model: which are traced, which are structure, and how they are checked.
 
-Values that are known when a model is built are validated there. Values under a JAX
-transformation are not known: one that cannot be becomes NaN (`require`), so that the solution's result tells.
+Values known when a model is built are checked there. Values that a JAX transformation traces are not known; one
+that fails a check becomes NaN (`require`), and the solution's result tells.
 """
 
 import numbers
@@ -33,7 +33,7 @@ Kinds = type | tuple[type, ...]
 
 
 class Constant(eqx.Module):
-    """An array that belongs to the structure of a mechanism: compared by value, never traced."""
+    """An array in the structure of a mechanism: compared by value, never traced."""
 
     entries: tuple = eqx.field(static=True)
 
@@ -42,6 +42,7 @@ class Constant(eqx.Module):
 
     @property
     def array(self) -> np.ndarray:
+        """The entries as an array."""
         return np.array(self.entries, dtype=np.float64)
 
 
@@ -50,17 +51,17 @@ def _as_tuples(nested: Any) -> Any:
 
 
 def value(entry: Constant | Array) -> Array:
-    """The array behind a `Constant`, or the traced array itself."""
+    """Return the array of a `Constant`; a traced array is its own."""
     return entry.array if isinstance(entry, Constant) else entry
 
 
 def namespace(*arrays: Array | np.floating) -> ModuleType:
-    """NumPy for arrays whose values are known, or jax.numpy where one is traced."""
+    """Return NumPy for arrays of known values, jax.numpy where one is traced."""
     return np if all(concrete(array) is not None for array in arrays) else jnp
 
 
 def number(entry: Any, shape: tuple[int, ...], what: str) -> Float[Array, "..."]:
-    """A traced leaf of the given shape in double precision; `what` names it in errors."""
+    """Convert a finite number, or an array of the given shape, to double precision; `what` names it in errors."""
     array = real(entry, what)
     if array.shape != shape:
         expected = "a single number" if shape == () else f"an array of shape {shape}"
@@ -69,13 +70,13 @@ def number(entry: Any, shape: tuple[int, ...], what: str) -> Float[Array, "..."]
 
 
 def is_finite(array: Array | np.floating) -> Any:
-    """Whether all numbers of an array are."""
+    """Tell whether all numbers of an array are finite."""
     known = concrete(array)
     return jnp.isfinite(array).all() if known is None else np.isfinite(known).all()
 
 
 def real(entry: Any, what: str) -> Float[Array, "..."]:
-    """Real numbers of any shape, in double precision; neither text, booleans nor None are taken for numbers."""
+    """Convert real numbers of any shape to double precision; text, booleans and None are no numbers."""
     return converted(entry, what, _in_double)
 
 
@@ -90,7 +91,7 @@ def _in_double(entry: Any) -> Array:
 
 
 def converted(entry: Any, what: str, convert: Callable[[Any], Kind]) -> Kind:
-    """What `convert` makes of an entry that holds real numbers alone."""
+    """Convert an entry by `convert`, where it holds real numbers alone."""
     try:
         if not all(map(_is_real, jax.tree.leaves(entry, is_leaf=lambda part: part is None))):
             raise TypeError("no real number")
@@ -114,35 +115,35 @@ MOST = 2**31 - 1  # that counts may be
 
 
 def whole_number(entry: Any, what: str, least: int = 1, most: int = MOST) -> int:
-    """An integer from `least` to `most`."""
+    """Check an integer from `least` to `most`."""
     if isinstance(entry, bool) or not isinstance(entry, int | np.integer) or not least <= entry <= most:
         raise ValueError(f"{what} is {entry!r}; it must be an integer of at least {least} and at most {most}")
     return int(entry)
 
 
 def require_bool(entry: Any, what: str) -> bool:
-    """True or False."""
+    """Check a flag: True or False."""
     if not isinstance(entry, bool | np.bool_):
         raise ValueError(f"{what} is {entry!r}; give True or False")
     return bool(entry)
 
 
 def one_of(entry: Word, choices: tuple[Word, ...], what: str) -> Word:
-    """One of several words."""
+    """Check that a word is one of several."""
     if not isinstance(entry, str) or entry not in choices:
         raise ValueError(f"{what} is {entry!r}; known: {', '.join(map(repr, choices))}")
     return entry
 
 
 def require_type(entry: Any, kind: Kinds, what: str, remedy: str) -> Any:
-    """Something of a kind, or of one of several."""
+    """Check that an entry is of a kind, or of one of several."""
     if not isinstance(entry, kind):
         raise ValueError(f"{what} is {entry!r}; {remedy}")
     return entry
 
 
 def listed(entries: Any, kind: Kinds, what: str, remedy: str) -> list[Any]:
-    """A list of things of a kind, or of one of several."""
+    """List entries that are all of a kind, or of one of several."""
     try:
         found = list(entries)
     except TypeError as error:
@@ -151,10 +152,10 @@ def listed(entries: Any, kind: Kinds, what: str, remedy: str) -> list[Any]:
 
 
 def require(array: Array, condition: Callable[[Array], Any], what: str, remedy: str) -> Array:
-    """An array that meets a condition.
+    """Check that an array meets a condition.
 
-    Where the condition is known, it raises a ValueError if it fails; where it is traced, an array that fails it is
-    NaN, which the result of a simulation tells.
+    An array that fails raises a `ValueError` where its values are known. Where they are traced it becomes NaN, which
+    the result of a simulation tells.
     """
     known = concrete(array)
     met = condition(lax.stop_gradient(array) if known is None else known)
@@ -166,17 +167,17 @@ def require(array: Array, condition: Callable[[Array], Any], what: str, remedy: 
 
 
 def positive(entry: Any, what: str, remedy: str = "it must be positive") -> Scalar:
-    """A positive number."""
+    """Check a positive number."""
     return require(number(entry, (), what), lambda x: x > 0.0, what, remedy)
 
 
 def zero_or_more(entry: Any, what: str) -> Scalar:
-    """A number that is not negative."""
+    """Check a number that is not negative."""
     return require(number(entry, (), what), lambda x: x >= 0.0, what, "it must be zero or more")
 
 
 def unit_axis(axis: Axis, what: str) -> Constant | Float[Array, "3"]:
-    """A unit vector from a name ("x", "-z"), numbers (structure), or a JAX array (traced)."""
+    """Make a unit vector from a name ("x", "-z") or numbers, both structure, or from a JAX array, which is traced."""
     if isinstance(axis, str):
         if axis not in COORDINATE_AXES:
             known_axes = ", ".join(COORDINATE_AXES)
@@ -200,7 +201,7 @@ def _is_length(length: Any) -> Any:
 def perpendicular_axes(
     first: Constant | Float[Array, "3"], axis: Axis, what: str
 ) -> tuple[Constant | Float[Array, "3"], Constant | Float[Array, "3"]]:
-    """Two unit vectors, the first as `unit_axis` made it, the second from `axis` and checked to be at a right angle."""
+    """Make a second unit vector from `axis`, check that it is at a right angle to the first, and return both."""
     second = unit_axis(axis, what)
     one, other = value(first), value(second)
     cosine = concrete(one @ other)
@@ -213,7 +214,7 @@ def perpendicular_axes(
 
 
 def rotation_matrix(rotation: Matrix | None, what: str) -> Constant | Float[Array, "3 3"]:
-    """A rotation: None (identity) and numbers are structure, a JAX array is traced."""
+    """Check a rotation matrix. None (no rotation) and numbers are structure, a JAX array is traced."""
     if rotation is None:
         return Constant(np.eye(3))
     remedy = "its columns must be the orthonormal, right-handed axes of the frame"

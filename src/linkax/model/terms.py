@@ -1,4 +1,4 @@
-"""Which coordinate or speed of a joint an element acts along."""
+"""Coordinates and speeds of joints, by name and index."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Term(NamedTuple):
-    """A joint's name, and which of its speeds, counted from 0; None for the only one."""
+    """The name of a joint, and the index of one of its speeds from 0; None for its only one."""
 
     joint: str
     index: int | None
@@ -16,7 +16,7 @@ TermLike = str | tuple[str, int | None]  # a joint's name, or (name, index of it
 
 
 def term(entry: TermLike, what: str) -> Term:
-    """A joint's name, or (name, index), as a user gives it; `what` names the element in errors."""
+    """Read a joint's name, or (name, index), as a user gives it; `what` names the element in errors."""
     joint, index = entry if isinstance(entry, tuple) and len(entry) == 2 else (entry, None)
     whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
     if not isinstance(joint, str) or not (index is None or whole):

@@ -1,1 +1,1 @@
-"""Geometry: rotations and vector products. No mechanics."""
+"""Geometry without mechanics: vectors, rotations, quaternions, screws."""

@@ -1,7 +1,7 @@
-"""Unit quaternions (w, x, y, z), shape (..., 4): orientations without a singular one.
+"""Unit quaternions q = (w, x, y, z), shape (..., 4).
 
-A quaternion is that of the rotation whose columns are the rotated axes, and q and −q are the same
-rotation. Smooth everywhere, at no rotation too.
+They describe every orientation without a singular one; q and −q are the same rotation, whose matrix has the
+rotated axes as columns. All functions are smooth, also where there is no rotation.
 """
 
 import jax
@@ -15,24 +15,24 @@ SMALL = 1e-8  # squares of half angles for which two terms of the series are exa
 
 
 def multiply(a: Float[Array, "*#batch 4"], b: Float[Array, "*#batch 4"]) -> Float[jax.Array, "... 4"]:
-    """The product of two quaternions: the rotation b first, then a."""
+    """Multiply two quaternions: rotate by b first, then by a."""
     real = a[..., 0] * b[..., 0] - dot(a[..., 1:], b[..., 1:])
     vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + cross(a[..., 1:], b[..., 1:])
     return jnp.concatenate([real[..., None], vector], axis=-1)
 
 
 def conjugate(quaternion: Float[Array, "*batch 4"]) -> Float[jax.Array, "*batch 4"]:
-    """The inverse of a unit quaternion."""
+    """Invert a unit quaternion: (w, −x, −y, −z)."""
     return jnp.concatenate([quaternion[..., :1], -quaternion[..., 1:]], axis=-1)
 
 
 def normalised(quaternion: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
-    """The unit quaternion along a nonzero one."""
+    """Divide a nonzero quaternion by its length."""
     return quaternion / jnp.sqrt(dot(quaternion, quaternion))[..., None]
 
 
 def rotation_matrix(quaternion: Float[Array, "*batch 4"]) -> Float[jax.Array, "*batch 3 3"]:
-    """The rotation (..., 3, 3) of a nonzero quaternion of any length."""
+    """Convert a nonzero quaternion of any length to a rotation matrix (..., 3, 3)."""
     w, x, y, z = (quaternion[..., i] for i in range(4))
     s = 2.0 / dot(quaternion, quaternion)
     rows = [
@@ -44,7 +44,7 @@ def rotation_matrix(quaternion: Float[Array, "*batch 4"]) -> Float[jax.Array, "*
 
 
 def from_rotation_vector(vector: Float[Array, "*batch 3"]) -> Float[jax.Array, "*batch 4"]:
-    """The quaternion of a turn by |vector| [rad] about a vector (..., 3)."""
+    """Convert a rotation vector (..., 3), a turn by |vector| [rad] about it, to a quaternion."""
     half = 0.5 * vector
     square = dot(half, half)
     angle = jnp.sqrt(jnp.where(square > SMALL, square, 1.0))
@@ -54,7 +54,7 @@ def from_rotation_vector(vector: Float[Array, "*batch 3"]) -> Float[jax.Array, "
 
 
 def rotation_vector(quaternion: Float[Array, "*batch 4"]) -> Float[jax.Array, "*batch 3"]:
-    """The shortest turn (..., 3) [rad] that a unit quaternion is; turns by π have two."""
+    """Convert a unit quaternion to its shortest rotation vector (..., 3) [rad]; turns by π have two."""
     quaternion = jnp.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
     real, vector = quaternion[..., 0], quaternion[..., 1:]
     square = dot(vector, vector)
@@ -64,11 +64,11 @@ def rotation_vector(quaternion: Float[Array, "*batch 4"]) -> Float[jax.Array, "*
 
 
 def from_rotation_matrix(rotation: Float[Array, "*batch 3 3"]) -> Float[jax.Array, "*batch 4"]:
-    """The quaternion with w ≥ 0 of a rotation (..., 3, 3), by the largest of its four parts."""
+    """Convert a rotation matrix (..., 3, 3) to the quaternion with w ≥ 0, from its largest component."""
     r = lambda i, j: rotation[..., i, j]
     across = [r(2, 1) - r(1, 2), r(0, 2) - r(2, 0), r(1, 0) - r(0, 1)]
     sums = [r(2, 1) + r(1, 2), r(0, 2) + r(2, 0), r(1, 0) + r(0, 1)]
-    # Each row is the quaternion times four times one of its parts.
+    # Row i is 4 qᵢ q.
     rows = [
         [1.0 + r(0, 0) + r(1, 1) + r(2, 2), *across],
         [across[0], 1.0 + r(0, 0) - r(1, 1) - r(2, 2), sums[2], sums[1]],

@@ -1,4 +1,4 @@
-"""Rotations as 3x3 matrices whose columns are the rotated axes."""
+"""Rotations as 3 × 3 matrices, whose columns are the rotated axes."""
 
 import jax
 import jax.numpy as jnp
@@ -15,38 +15,38 @@ COORDINATE_AXES = {
 
 
 def rotate(rotation: Float[Array, "*#batch 3 3"], vector: Float[Array, "*#batch 3"]) -> Float[jax.Array, "... 3"]:
-    """Rotate vectors (..., 3) by rotations (..., 3, 3)."""
+    """Rotate vectors v (..., 3) by rotations R (..., 3, 3): R v."""
     return jnp.sum(rotation * vector[..., None, :], axis=-1)
 
 
 def compose(first: Float[Array, "*#batch l m"], second: Float[Array, "*#batch m n"]) -> Float[jax.Array, "... l n"]:
-    """Product of rotations (..., 3, 3), or of other matrices: `second` is applied first to a vector."""
+    """Multiply rotations (..., 3, 3), or other matrices; `second` acts on a vector first."""
     return jnp.sum(first[..., :, :, None] * second[..., None, :, :], axis=-2)
 
 
 def transpose(rotation: Float[Array, "*batch 3 3"]) -> Float[jax.Array, "*batch 3 3"]:
-    """Inverse of a rotation, shape (..., 3, 3)."""
+    """Invert a rotation R, shape (..., 3, 3): Rᵀ."""
     return jnp.swapaxes(rotation, -1, -2)
 
 
 def rotation_about_first_axis(angle: Scalar) -> Float[jax.Array, "3 3"]:
-    """Rotation by `angle` [rad] about the first axis."""
+    """Make the rotation by `angle` [rad] about the first axis."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     zero, one = jnp.zeros_like(c), jnp.ones_like(c)
     return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
 
 
 def angle_about_first_axis(rotation: Float[Array, "3 3"]) -> Float[jax.Array, ""]:
-    """The angle [rad] in (−π, π] of a rotation (3, 3) about the first axis."""
+    """Read the angle [rad], in (−π, π], of a rotation (3, 3) about the first axis."""
     return jnp.arctan2(rotation[2, 1], rotation[1, 1])
 
 
 def frame_about_axis(axis: Float[Array, "3"], second: Float[Array, "3"] | None = None) -> Float[Array, "3 3"]:
-    """A right-handed frame whose first axis is the unit vector `axis`, shape (3, 3).
+    """Make a right-handed frame, shape (3, 3), whose first axis is the unit vector `axis`.
 
-    The second axis is given, a unit vector at a right angle, or is the normalised product of the
-    coordinate axis that is farthest from `axis` (in cyclic order) with it, so coordinate axes give
-    coordinate frames. NumPy in gives NumPy out.
+    Its second axis is `second`, a unit vector at a right angle to it, or e × axis, normalised, where e comes
+    before the coordinate axis nearest to `axis` in cyclic order; so coordinate axes give coordinate frames.
+    NumPy's arrays give NumPy's.
     """
     xp = np if isinstance(axis, np.ndarray) and isinstance(second, np.ndarray | None) else jnp
     if second is None:

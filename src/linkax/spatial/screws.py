@@ -1,8 +1,8 @@
-"""Rigid motions, (..., 4, 4), and the screws whose exponentials they are.
+"""Rigid motions, (..., 4, 4), as exponentials of screws, (..., 6).
 
-A motion takes points (p, 1) to (R p + d, 1), R the rotation, axes as columns, d the translation. A screw is a
-turn and an advance, (..., 6), or the matrix of both. Everything is smooth at every argument, and made of
-few operations, since beams differentiate it several times.
+A motion [[R, d], [0, 1]] takes a point p to R p + d; the columns of R are the rotated axes. A screw is a turn a
+and an advance b, or the matrix [[â, b], [0, 0]] of both, where â p = a × p. All functions are smooth at every
+argument, and made of few operations, since beams differentiate them several times.
 """
 
 import math
@@ -28,7 +28,7 @@ GENERATORS[[3, 4, 5], [0, 1, 2], 3] = 1.0
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _series(order: int, x: Float[Array, "*batch"]) -> Float[jax.Array, "*batch 2"]:
-    """Both series, or derivatives of that order, (..., 2); in few operations, whatever the order."""
+    """Evaluate both series, or their derivatives of that order, (..., 2), in few operations whatever the order."""
     coefficients = np.zeros_like(SERIES)
     coefficients[: TERMS - order] = SERIES[order:]
     coefficients *= np.array([math.perm(k + order, order) for k in range(TERMS)])[:, None]
@@ -46,12 +46,15 @@ def _series_jvp(order, primals, changes):
 
 
 def screw_matrix(screw: Float[Array, "*batch 6"]) -> Float[jax.Array, "*batch 4 4"]:
-    """The matrices (..., 4, 4) of screws (..., 6)."""
+    """Write screws (..., 6) as matrices (..., 4, 4)."""
     return jnp.tensordot(screw, jnp.asarray(GENERATORS, screw.dtype), 1)
 
 
 def exponential(screw: Float[Array, "*batch 4 4"]) -> Float[jax.Array, "*batch 4 4"]:
-    """The motion (Rodrigues) along a constant screw, given as its matrix (..., 4, 4)."""
+    """Move along a constant screw, given as its matrix S (..., 4, 4), by Rodrigues' formula.
+
+    exp S = 1 + S + (1 − cos a) / a² S² + (a − sin a) / a³ S³, where a is the angle of its turn [rad].
+    """
     square = compose(screw, screw)
     # The trace is −2 a².
     series = _series(0, -jnp.trace(square, axis1=-2, axis2=-1) / 2.0)[..., None, None]
@@ -64,6 +67,6 @@ def exponential(screw: Float[Array, "*batch 4 4"]) -> Float[jax.Array, "*batch 4
 
 
 def turn_rate(change: Float[Array, "*#batch 3 3"], rotation: Float[Array, "*#batch 3 3"]) -> Float[jax.Array, "... 3"]:
-    """The vector (..., 3) of the antisymmetric part of change × rotationᵀ: the angular velocity of a rate of change."""
+    """Compute the angular velocity (..., 3) from a rotation R and its rate Ṙ: the antisymmetric part of Ṙ Rᵀ."""
     across = compose(change, transpose(rotation))
     return jnp.tensordot(across, jnp.asarray(np.swapaxes(LEVI_CIVITA, 0, 2) / 2.0, across.dtype), 2)
