@@ -29,11 +29,11 @@ GROUND_NAME = "ground"
 
 
 class Frame(eqx.Module):
-    """A frame fixed to a body, from `body.at(...)`.
+    """A frame fixed to a body, made by `body.at(...)`.
 
     - `body`: the name of the body.
-    - `offset`: origin of the frame in the body's reference frame [m], shape (3,).
-    - `rotation`: axes of the frame as columns, in the body's axes, shape (3, 3).
+    - `offset`: its origin in the body's reference frame [m], shape (3,).
+    - `rotation`: its axes as columns, in the body's axes, shape (3, 3).
     """
 
     body: str = eqx.field(static=True)
@@ -42,19 +42,20 @@ class Frame(eqx.Module):
 
 
 class AbstractBody(eqx.Module):
-    """What joints and forces attach to."""
+    """A body that joints and forces attach to."""
 
     @property
     @abc.abstractmethod
     def reference(self) -> Frame:
-        """Its reference frame, which it stands for itself."""
+        """Its reference frame, for which the body itself stands where a frame is expected."""
 
 
 class Ground(AbstractBody):
-    """The fixed world, body `lx.GROUND`: joints start from it, nothing moves it."""
+    """The fixed world, `lx.GROUND`. Joints attach to it, and nothing moves it."""
 
     @property
     def name(self) -> str:
+        """The name that no other body may have."""
         return GROUND_NAME
 
     @property
@@ -62,7 +63,13 @@ class Ground(AbstractBody):
         return self.at([0.0, 0.0, 0.0])
 
     def at(self, offset: Vector, rotation: Matrix | None = None) -> Frame:
-        """A frame fixed to the ground: origin `offset` [m] and axes `rotation` in world axes."""
+        """Make a frame fixed to the ground.
+
+        **Arguments:**
+
+        - `offset`: [x, y, z] of its origin [m].
+        - `rotation`: its axes as columns, in ground axes, shape (3, 3) (default: parallel).
+        """
         return Frame(
             GROUND_NAME,
             number(offset, (3,), "offset of a frame on the ground"),
@@ -83,12 +90,11 @@ class RigidBody(AbstractBody):
     - `name`: unique in the mechanism.
     - `mass`: [kg], zero or more.
     - `center_of_mass`: [m], shape (3,).
-    - `inertia`: inertia tensor about the centre of mass [kg m²], shape (3, 3), or its
-      diagonal, shape (3,).
-    - `frames`: named points, `{"tip": [x, y, z]}` [m], to be used as `body.at("tip")`.
+    - `inertia`: inertia tensor about the centre of mass [kg m²], shape (3, 3), or its diagonal, shape (3,).
+    - `frames`: named points `{"tip": [x, y, z]}` [m], for `body.at("tip")`.
 
-    **Raises:** `ValueError` for a negative or non-finite mass, and for a tensor that no body
-    can have (asymmetric, a negative principal moment, or one larger than the sum of the others).
+    **Raises:** `ValueError` for a mass that is negative or not finite, and for an inertia tensor that no body has: one
+    that is not symmetric, with a negative principal moment, or with one larger than the sum of the others.
     """
 
     name: str = eqx.field(static=True)
@@ -126,12 +132,14 @@ class RigidBody(AbstractBody):
         return self.at([0.0, 0.0, 0.0])
 
     def at(self, where: str | Vector, rotation: Matrix | None = None) -> Frame:
-        """A frame on this body: at a named frame or at an offset [m], with axes `rotation`.
+        """Make a frame on this body.
 
         **Arguments:**
 
-        - `where`: a name in `frames`, or [x, y, z] in the body's reference frame [m].
-        - `rotation`: axes of the frame as columns, in the body's axes (default: parallel).
+        - `where`: its origin, a name in `frames` or [x, y, z] in the body's reference frame [m].
+        - `rotation`: its axes as columns, in the body's axes, shape (3, 3) (default: parallel).
+
+        **Raises:** `ValueError` for an unknown name, and for axes that are not orthonormal and right-handed.
         """
         if isinstance(where, str):
             if where not in self.frames:
@@ -146,7 +154,7 @@ class RigidBody(AbstractBody):
 
 
 def body_name(name: Any) -> str:
-    """The name of a body, checked."""
+    """Check the name of a body."""
     if not isinstance(name, str) or not name:
         raise ValueError(f"body name is {name!r}; give a non-empty string")
     if name == GROUND_NAME:
@@ -155,7 +163,7 @@ def body_name(name: Any) -> str:
 
 
 def frame_of(place: BodyOrFrame, what: str) -> Frame:
-    """The frame that a user means by a body, `body.at(...)`, or the ground; `what` names it in errors."""
+    """Return the frame that a body, `body.at(...)` or the ground stands for; `what` names it in errors."""
     if isinstance(place, AbstractBody):
         return place.reference
     if isinstance(place, Frame):
@@ -164,14 +172,14 @@ def frame_of(place: BodyOrFrame, what: str) -> Frame:
 
 
 def _depth(entry: Any) -> int:
-    """Number of dimensions of an array, or of lists of numbers that may be traced."""
+    """Count the dimensions of an array, or of nested lists of numbers that may be traced."""
     if isinstance(entry, list | tuple):
         return 1 + (_depth(entry[0]) if entry else 0)
     return np.ndim(entry)
 
 
 def inertia_tensor(inertia: Matrix, what: str) -> Float[Array, "3 3"]:
-    """A tensor that a body can have, (3, 3), of itself or of its diagonal; `what` names it in errors."""
+    """Check an inertia tensor, (3, 3), given as a whole or by its diagonal; `what` names it in errors."""
     diagonal = _depth(inertia) == 1
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)
     if diagonal:
@@ -192,16 +200,20 @@ def _is_symmetric(tensor: Array) -> Any:
 
 
 def _principal_moments(tensor: Array, diagonal: bool) -> Float[Array, "3"]:
-    """In rising order; without derivative."""
+    """Principal moments in rising order, without derivative."""
     xp = namespace(tensor)
     tensor = tensor if xp is np else lax.stop_gradient(tensor)
     return xp.sort(xp.diagonal(tensor)) if diagonal else xp.linalg.eigvalsh(tensor / 2.0 + tensor.T / 2.0)
 
 
 def rod(name: str, length: Number, mass: Number) -> RigidBody:
-    """A uniform slender rod along its x axis, from frame "base" (its reference) to "tip".
+    """Make a uniform slender rod along its x axis, from frame "base", its reference frame, to frame "tip".
 
-    `length` [m], `mass` [kg]; mass × length² / 12 about the transverse axes, none about its own.
+    Its moment of inertia is mass × length² / 12 about transverse axes, and zero about its own.
+
+    **Arguments:** `name`: unique in the mechanism; `length` [m]; `mass` [kg].
+
+    **Raises:** `ValueError` for a length that is not positive, and for a negative mass.
     """
     length = positive(length, f"rod {name!r}: length [m]")
     mass = number(mass, (), f"body {name!r}: mass [kg]")
@@ -216,12 +228,20 @@ def rod(name: str, length: Number, mass: Number) -> RigidBody:
 
 
 def point_mass(name: str, mass: Number) -> RigidBody:
-    """A mass [kg] at the origin of its frame, without rotational inertia."""
+    """Make a point of `mass` [kg] at the origin of its frame, without rotational inertia.
+
+    **Raises:** `ValueError` for a negative mass.
+    """
     return RigidBody(name, mass)
 
 
 def box(name: str, size: Vector, mass: Number) -> RigidBody:
-    """A uniform box with its centre as reference; `size` is its extent along x, y, z [m]."""
+    """Make a uniform box, with its reference frame at its centre.
+
+    **Arguments:** `name`: unique in the mechanism; `size`: its extent along x, y, z [m], shape (3,); `mass` [kg].
+
+    **Raises:** `ValueError` for a size that is not positive, and for a negative mass.
+    """
     what = f"box {name!r}: size [m]"
     size = require(number(size, (3,), what), lambda metres: (metres > 0.0).all(), what, "all must be positive")
     mass = number(mass, (), f"body {name!r}: mass [kg]")

@@ -18,7 +18,7 @@ from linkax.xla.arrays import Array, Scalar
 
 
 class AbstractConstraint(AbstractElement):
-    """One equation: what is constrained = right side. Its multiplier is `Solution.reaction` of its name."""
+    """One equation, value = right side. `Solution.reaction` of its name is its multiplier."""
 
     name: str = eqx.field(static=True)
 
@@ -28,22 +28,22 @@ class AbstractConstraint(AbstractElement):
 
     @property
     def is_driven(self) -> bool:
-        """Whether the right side changes with time."""
+        """Whether the right side depends on time."""
         return False
 
     @abc.abstractmethod
     def right_side(self, t: Number) -> Scalar:
-        """At time t [s]."""
+        """Compute the right side at time t [s]."""
 
     def held(self, t: Number, unless: Any = False) -> "AbstractConstraint":
-        """The same with the right side of time t for ever, where it is not to go on; that may be traced."""
+        """Return the constraint with its right side kept from time t on, except where `unless`, which may be traced."""
         return self
 
 
 class LinearConstraint(AbstractConstraint):
     """A linear relation between coordinates of joints in the tree: Σ coefficient × coordinate = right side.
 
-    - `related`: whose coordinates these are.
+    - `related`: the terms of these coordinates.
     """
 
     related: tuple[Term, ...] = eqx.field(static=True)
@@ -57,18 +57,18 @@ class LinearConstraint(AbstractConstraint):
 class Coupling(LinearConstraint):
     """A linear relation between joint coordinates, such as gears, a rack, or a rope over sheaves.
 
-    `Coupling("gears", {"pinion": 2.0, "wheel": 1.0})` keeps 2 × pinion + wheel = 0. The joints go
-    into the spanning tree, so that angles count whole turns. Its reaction is one number, μ: it
-    acts along each joint with coefficient × μ [N m or N].
+    `Coupling("gears", {"pinion": 2.0, "wheel": 1.0})` keeps 2 × pinion + wheel = 0. Its joints are in the spanning
+    tree, so angles count whole turns. Its reaction is one number μ, and acts along each joint with coefficient × μ
+    [N m or N].
 
     **Arguments:**
 
     - `name`: unique among joints and constraints.
-    - `coefficients`: {joint: factor of its coordinate [rad or m]}. For one of several coordinates
-      give (joint, index), counted like the joint's speeds.
-    - `offset`: what the sum is equal to.
+    - `coefficients`: {joint: factor of its coordinate [rad or m]}. For one of several coordinates the key is
+      (joint, index), counted like the joint's speeds.
+    - `offset`: the right side.
 
-    **Raises:** `ValueError` for no coefficient, or for all of them zero.
+    **Raises:** `ValueError` without coefficients, or where all are zero.
     """
 
     offset: Scalar
@@ -94,17 +94,17 @@ class Coupling(LinearConstraint):
 
 
 class Drive(LinearConstraint):
-    """A joint's coordinate prescribed as a function of time. Its reaction is the driving torque.
+    """A joint's coordinate as a given function of time.
 
-    `Drive("motor", "bearing", lambda t: 2.0 * t)` turns `bearing` at 2 rad/s. The reaction is the
-    torque [N m], or force [N] on a slide, along the joint.
+    `Drive("motor", "bearing", lambda t: 2.0 * t)` turns `bearing` at 2 rad/s. Its reaction is the driving torque
+    [N m], or force [N] on a slide, along the joint.
 
     **Arguments:**
 
     - `name`: unique among joints and constraints.
     - `joint`: a joint's name, or (name, index) for one of several coordinates, counted like speeds.
-    - `motion`: t [s] ↦ coordinate [rad or m], twice differentiable by JAX. JAX arrays that it
-      closes over are traced; all else that it reads is structure, and is not to change later.
+    - `motion`: t [s] ↦ coordinate [rad or m], twice differentiable by JAX. JAX arrays that it closes over are
+      traced; all else that it reads is structure, and must not change later.
 
     **Raises:** `ValueError` for a function that does not return one number.
     """
@@ -134,7 +134,7 @@ class Drive(LinearConstraint):
 
 
 def checked_name(name: Any, what: str) -> str:
-    """The name of a constraint, checked."""
+    """Check the name of a constraint."""
     if not isinstance(name, str) or not name:
         raise ValueError(f"{what} name is {name!r}; give a non-empty string")
     return name

@@ -8,7 +8,9 @@ import equinox as eqx
 from linkax.model.bodies import Frame
 from linkax.model.terms import Term
 
-# Of higher layers, which import this one: linkax.Motion, its `configuration`, and its `system`.
+# What elements are given. All but time is of higher layers, which import this one: linkax.Motion, its `configuration`,
+# and the `system` of both. A user's own class may say more than `Any`.
+Time = Any  # t [s], a number that is mostly traced
 Motion = Any
 Configuration = Any
 System = Any

@@ -1,4 +1,4 @@
-"""Force elements: what acts on a mechanism besides its joints."""
+"""Force elements, and gravity. Others are in `joint_forces`, `point_forces` and `ropes`."""
 
 import abc
 from collections.abc import Iterable
@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import Frame
-from linkax.model.elements import AbstractElement, Configuration, Motion, System
+from linkax.model.elements import AbstractElement, Configuration, Motion, System, Time
 from linkax.model.functions import raised
-from linkax.model.numbers import Number, Vector, number
+from linkax.model.numbers import Vector, number
 from linkax.xla.arrays import Array, Scalar
 
 
 class Load(NamedTuple):
-    """What force elements apply.
+    """Forces and moments that a force element applies.
 
     - `force`: on each body, at its centre of mass, in ground axes [N], shape (n_b, 3).
     - `moment`: on each body, about its centre of mass, in ground axes [N m], shape (n_b, 3).
@@ -29,11 +29,12 @@ class Load(NamedTuple):
 
     @staticmethod
     def none(system: System) -> "Load":
+        """Make a load of zeros for `motion.system`."""
         vectors = jnp.zeros((system.topology.num_bodies, 3), system.dtype)
         return Load(vectors, vectors, jnp.zeros(system.topology.num_speeds, system.dtype))
 
     def plus(self, other: "Load") -> "Load":
-        """Both together."""
+        """Add another load."""
         return Load(*(a + b for a, b in zip(self, other, strict=True)))
 
 
@@ -41,19 +42,19 @@ GIVE_LOAD = "give a linkax.Load, made by motion.point_load, motion.joint_load or
 
 
 class AbstractForce(AbstractElement):
-    """A force element; a user's own is a subclass with a `load`.
+    """A force element. To make your own, subclass it and define `load`.
 
-    `motion` is a `linkax.Motion`: where all bodies are and how they move at one instant, and how
-    loads on points and along joints are made. `motion.system` has the mechanism's numbers in the
-    order of its bodies. Numbers that are fields are traced.
+    Its fields that hold numbers are traced. `motion` is a `linkax.Motion`: it tells where all bodies are and how
+    they move at one instant, and makes loads on points and along joints. `motion.system` has the mechanism's numbers
+    in the order of its bodies.
 
-    One whose load has a kink or a jump has a `switch` too, which is zero there, and its load is told the side:
-    `load(t, motion, on)`. Steps then end there, and derivatives are right across it.
+    A load with a kink or a jump needs a `switch`, which is zero there, and takes the side as a third argument:
+    `load(t, motion, on)`. Steps then end at the switch, and derivatives are right across it.
     """
 
     @property
     def needs_coordinate(self) -> bool:
-        """Whether it reads the coordinates of its joints, and not their speeds alone."""
+        """Whether it reads coordinates of its joints, besides their speeds."""
         return False
 
     @property
@@ -61,22 +62,26 @@ class AbstractForce(AbstractElement):
         return described(type(self).__name__, [repr(name) for name in self.joints] or named(self.frames))
 
     @abc.abstractmethod
-    def load(self, t: Number, motion: Motion, *args: Any, **kwargs: Any) -> Load:
-        """What the element applies at time t [s].
+    def load(self, t: Time, motion: Motion, *args: Any, **kwargs: Any) -> Load:
+        """Compute the load at time t [s].
 
-        Where it has a `switch`, a third argument `on` says whether that is positive. A step that adapts keeps it as it
-        is where the step begins, so that the load goes on smoothly a little past zero.
+        With a `switch` it takes a third argument `on`: whether the switch is positive. A step that adapts keeps `on`
+        from where it begins, so that the load goes on smoothly a little past zero.
         """
 
-    def switch(self, t: Number, motion: Motion) -> Scalar | None:
-        """A number whose sign changes where the load has a kink or jumps; of magnitude one, like a strain.
+    def switch(self, t: Time, motion: Motion) -> Scalar | None:
+        """Compute a number that changes sign where the load has a kink or jumps; None for a smooth load.
 
-        The motion must go through zero there, and not be pushed back from both sides. None where there is none.
+        Its magnitude should be about one, like that of a strain. The motion must go through zero there, and not be
+        pushed back from both sides.
         """
         return None
 
-    def switched(self, t: Number, motion: Motion) -> Float[jax.Array, ""]:
-        """The switch, checked for what a user's own class may do wrong."""
+    def switched(self, t: Time, motion: Motion) -> Float[jax.Array, ""]:
+        """Compute the switch and check it.
+
+        **Raises:** `ValueError` for a switch that raises, or is not one number that depends on the motion.
+        """
         try:
             found = self.switch(t, motion)
         except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
@@ -87,8 +92,11 @@ class AbstractForce(AbstractElement):
             )
         return found
 
-    def applied(self, t: Number, motion: Motion, on: Any = None) -> Load:
-        """The load, checked for what a user's own class may do wrong; `on`: see `load`, by default as it is."""
+    def applied(self, t: Time, motion: Motion, on: Any = None) -> Load:
+        """Compute the load and check it; `on`: see `load`, by default whether the switch is positive now.
+
+        **Raises:** `ValueError` for a load that raises, is no `Load`, or has parts of another shape or type.
+        """
         side = ()
         if has_switch(self):
             side = (self.switched(t, motion) > 0.0 if on is None else on,)
@@ -109,32 +117,37 @@ class AbstractForce(AbstractElement):
         return found
 
     def potential_energy(self, configuration: Configuration) -> Scalar:
-        """Potential energy [J]; zero for an element that has none."""
+        """Compute the potential energy [J]; zero for an element without one."""
         return jnp.zeros((), configuration.system.dtype)
 
 
 def has_switch(force: AbstractForce) -> bool:
-    """Whether the load of a force element has a kink or jumps, see `AbstractForce.switch`."""
+    """Tell whether the load of a force element has a kink or jumps, see `AbstractForce.switch`."""
     return type(force).switch is not AbstractForce.switch
 
 
 def described(kind: str, of: list[str]) -> str:
+    """Name an element in errors by its kind and what it acts on."""
     return f"{kind} on {' and '.join(of)}" if of else kind
 
 
 def named(frames: Iterable[Frame]) -> list[str]:
+    """Name the bodies of frames in errors."""
     return [f"body {frame.body!r}" for frame in frames]
 
 
 class Gravity(AbstractForce):
-    """Uniform gravity: `acceleration` of free fall in ground axes [m/s²], shape (3,)."""
+    """Uniform gravity.
+
+    **Arguments:** `acceleration`: that of free fall, in ground axes [m/s²], shape (3,).
+    """
 
     acceleration: Float[Array, "3"]
 
     def __init__(self, acceleration: Vector):
         self.acceleration = number(acceleration, (3,), "Gravity: acceleration [m/s²]")
 
-    def load(self, t: Number, motion: Motion) -> Load:
+    def load(self, t: Time, motion: Motion) -> Load:
         none = Load.none(motion.system)
         return none._replace(force=motion.system.mass[:, None] * self.acceleration)
 

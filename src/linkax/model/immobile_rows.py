@@ -1,9 +1,8 @@
-"""Loop rows that no motion changes, such as the out-of-plane rows of a planar loop.
+"""Find loop rows that no motion changes, such as the out-of-plane rows of a planar loop.
 
-Found from the directions that belong to the structure (axes and rotations given as names or
-numbers), never from traced ones: a loop whose rotations all have one direction n keeps every
-vector along n fixed. Such a row is constant; it is checked where violations are reported, and
-left out of all equations.
+A loop whose joints all turn about one direction n keeps vectors along n fixed, and rows made of these constant.
+Equations leave such rows out; reports of violation check them. Only directions in the structure count (axes and
+rotations given as names or numbers), never traced ones.
 """
 
 from collections.abc import Callable
@@ -22,7 +21,7 @@ EVERY_ROW: Tests = (lambda i, j: True), (lambda i: True)
 
 
 def split_rows(tree: SpanningTree, all_rows: bool = False) -> dict[str, tuple]:
-    """The rows of all cut joints, those that move and those that do not (see `Topology`); or all as if they moved."""
+    """Sort the rows of all cut joints by whether motion changes them (see `Topology`); by `all_rows` all move."""
     orientation: Orientations = {GROUND_NAME: np.eye(3)}
     carrier_of: dict[str, tuple[AbstractJoint, str]] = {}
     for joint, predecessor in zip(tree.carriers, tree.predecessors, strict=True):
@@ -40,7 +39,7 @@ def split_rows(tree: SpanningTree, all_rows: bool = False) -> dict[str, tuple]:
 
 
 def _carried(joint: AbstractJoint, predecessor: str, orientation: np.ndarray | None) -> np.ndarray | None:
-    """Orientation of a body at coordinate zero, or None where it is traced."""
+    """Compute the orientation of a body at coordinate zero; None where it is traced."""
     if orientation is None or not _is_structure(joint):
         return None
     parent_axes, child_axes = joint.frames()
@@ -53,7 +52,7 @@ def _is_structure(joint: AbstractJoint) -> bool:
 
 
 def _loop(cut: AbstractJoint, carrier_of: dict[str, tuple[AbstractJoint, str]]) -> list[AbstractJoint]:
-    """The tree joints on one of the two ways from ground to the cut joint, but not on both."""
+    """List the tree joints of a loop: those on one of the two ways from ground to the cut joint, but not on both."""
 
     def way(body: str) -> dict[str, AbstractJoint]:
         joints = {}
@@ -67,7 +66,7 @@ def _loop(cut: AbstractJoint, carrier_of: dict[str, tuple[AbstractJoint, str]]) 
 
 
 def _mobile(cut: AbstractJoint, loop: list[AbstractJoint], orientation: Orientations) -> Tests:
-    """Two tests, whether the loop's motion changes h₁ⁱ·h₂ʲ and h₁ⁱ·s."""
+    """Make two tests: whether the loop's motion changes h₁ⁱ·h₂ʲ, and h₁ⁱ·s."""
     joints, child = [cut, *loop], orientation[cut.child.body]
     parents = [parent for joint in joints if (parent := orientation[joint.parent.body]) is not None]
     if child is None or len(parents) < len(joints) or not all(map(_is_structure, joints)):

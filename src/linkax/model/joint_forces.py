@@ -16,7 +16,7 @@ from linkax.xla.arrays import Scalar
 
 
 class _AlongJoint(AbstractForce):
-    """A torque, or a force on a slide, along one speed of a joint, and its opposite on the parent."""
+    """A torque, or a force on a slide, along one speed of a joint; its opposite acts on the parent."""
 
     joint: Term = eqx.field(static=True)
 
@@ -26,20 +26,20 @@ class _AlongJoint(AbstractForce):
 
     @abc.abstractmethod
     def torque_at(self, t: Number, motion: Motion) -> Scalar:
-        """Along the joint, on the child [N m or N]."""
+        """Compute the torque or force along the joint, on the child [N m or N]."""
 
     def load(self, t: Number, motion: Motion) -> Load:
         return motion.joint_load(self.joint, self.torque_at(t, motion))
 
 
 class JointTorque(_AlongJoint):
-    """A torque [N m], or force [N] on a slide, along a joint; on the child, and its opposite on the parent.
+    """A torque [N m], or a force [N] on a slide, along a joint, on the child; its opposite acts on the parent.
 
     **Arguments:**
 
     - `joint`: a joint's name, or (name, index) for one of several speeds.
-    - `torque`: a number, or a function (t, motion) ↦ number; what `motion` tells is in
-      `linkax.Motion`. What the function reads is as for `linkax.Drive`.
+    - `torque`: a number, or a function (t, motion) ↦ number, where `motion` is a `linkax.Motion`. What the
+      function may read is as for `linkax.Drive`.
     """
 
     torque: Scalar | Law
@@ -55,11 +55,11 @@ class JointTorque(_AlongJoint):
 class JointSpring(_AlongJoint):
     """A linear spring along a joint: −stiffness × (coordinate − free).
 
-    At a joint that is cut (where all joints of a loop have springs, say) the angle is read in
-    (−π, π] from `free`: the spring forgets whole turns.
+    At a cut joint (where all joints of a loop have springs, say) the angle from `free` is taken in (−π, π]: the
+    spring forgets whole turns.
 
     **Arguments:** `joint`: a name, or (name, index); `stiffness` [N m/rad or N/m]; `free`: the
-    coordinate at which it is unstrained [rad or m].
+    coordinate where it is unstrained [rad or m].
     """
 
     stiffness: Scalar
@@ -83,7 +83,10 @@ class JointSpring(_AlongJoint):
 
 
 class JointDamper(_AlongJoint):
-    """Viscous damping along a joint: −damping × speed, `damping` in N m s/rad or N s/m."""
+    """Viscous damping along a joint: −damping × speed.
+
+    **Arguments:** `joint`: a name, or (name, index); `damping` [N m s/rad or N s/m].
+    """
 
     damping: Scalar
 
@@ -98,8 +101,10 @@ class JointDamper(_AlongJoint):
 class JointFriction(_AlongJoint):
     """Coulomb friction along a joint, regularised: −torque × tanh(speed / scale).
 
-    Below `scale` [rad/s or m/s] it is nearly viscous, so that a joint at rest under a load creeps;
-    at three scales it has 99.5 % of `torque` [N m or N]. The smaller the scale, the stiffer.
+    Below `scale` it is nearly viscous, so a joint at rest under a load creeps; at 3 × scale it has 99.5 % of
+    `torque`. The smaller the scale, the stiffer the motion.
+
+    **Arguments:** `joint`: a name, or (name, index); `torque` [N m or N]; `scale` [rad/s or m/s].
 
     **Raises:** `ValueError` for a negative torque, or a scale that is not positive.
     """

@@ -1,4 +1,4 @@
-"""A mechanism: bodies, joints, constraints and forces, checked, with its spanning tree."""
+"""Mechanisms: bodies, joints, constraints and forces, checked, with a spanning tree."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,25 +21,27 @@ from linkax.model.topology import GROUND_INDEX, Topology
 
 
 class Mechanism(eqx.Module):
-    """Bodies held together by joints, with the constraints and the forces on them.
+    """Bodies connected by joints, with the constraints and forces on them.
 
-    Beams are taken apart into sections, bodies with names such as "boom[2.5]" (in elements from the base), and
-    places on them that something attaches to into massless bodies. `beams` holds them as they were given.
+    The spanning tree and the cut joints are found here, whatever the order of the joints: joints first that a
+    constraint relates or a force acts along, then breadth first from ground.
+    `print(mechanism.topology.describe())` shows the tree; `cut=True` cuts a joint. Bodies and joints are kept in
+    the order of the tree.
 
-    The spanning tree and the cut joints are found here, in any order of the joints: breadth
-    first from ground, joints that carry a constraint or a force element first.
-    `print(mechanism.topology.describe())` shows the choice; `cut=True` on a joint forces it. Bodies
-    and joints are kept in tree order.
+    A beam becomes sections, bodies with names such as "boom[2.5]" (counted in elements from the base), and a
+    massless body at each place that something attaches to. `beams` holds the beams as given.
 
     **Arguments:**
 
-    - `bodies`, `joints`, `forces`: sequences; names unique among bodies and among joints.
-    - `constraints`: `Coupling`, `Drive`, `Rope` and `Distance`; names unique among joints and constraints.
-    - `all_rows`: keep those loop rows too that no motion changes, such as the out-of-plane rows of a planar
-      loop. It changes no motion; Lagrange multipliers fail on such rows.
+    - `bodies`: `RigidBody` and `Beam`; names unique.
+    - `joints`: `Revolute`, `Prismatic` and others; names unique among joints and constraints.
+    - `forces`: `Gravity`, `Spring` and others.
+    - `constraints`: `Coupling`, `Drive`, `Rope` and `Distance`.
+    - `all_rows`: keep also loop rows that no motion changes, such as the out-of-plane rows of a planar loop. The
+      motion is the same; Lagrange multipliers fail on such rows.
 
-    **Raises:** `ValueError` naming the element: a duplicate or unknown name, a body that no
-    joint connects to ground, a joint with `cut=True` that closes no loop.
+    **Raises:** `ValueError` naming the element: a duplicate or unknown name, a body that no joint connects to
+    ground, a joint with `cut=True` that closes no loop.
     """
 
     bodies: tuple[RigidBody, ...]
@@ -70,17 +72,23 @@ class Mechanism(eqx.Module):
         self.topology = _topology(tree, parts.constraints, require_bool(all_rows, "all_rows"))
 
     def with_all_rows(self) -> "Mechanism":
-        """The same mechanism with those loop rows too that no motion changes (see `all_rows`)."""
+        """Return the same mechanism with the loop rows too that no motion changes (see `all_rows`)."""
         bodies = (*self.bodies, *self.beams)
         return Mechanism(bodies, self.joints, self.forces, self.constraints, all_rows=True)
 
     def body(self, name: str) -> RigidBody | Beam:
-        """The body of that name, a beam or one of its sections too."""
+        """Return the body of that name, which may be a beam or one of its sections.
+
+        **Raises:** `ValueError` for an unknown name.
+        """
         names = (*self.topology.bodies, *(beam.name for beam in self.beams))
         return (*self.bodies, *self.beams)[_find(name, names, "body")]
 
     def joint(self, name: str) -> AbstractJoint:
-        """The joint of that name."""
+        """Return the joint of that name.
+
+        **Raises:** `ValueError` for an unknown name.
+        """
         return self.joints[_find(name, self.topology.joints, "joint")]
 
 
@@ -93,7 +101,7 @@ def _find(name: Any, names: tuple[str, ...], what: str) -> int:
 def _listed(
     bodies: Any, joints: Any, forces: Any, constraints: Any
 ) -> tuple[list[RigidBody | Beam], list[AbstractJoint], list[AbstractForce], list[AbstractConstraint]]:
-    """What a user gives as lists, checked. A `Distance` among the constraints goes to the joints."""
+    """Check and list what a user gives. A `Distance` moves from the constraints to the joints."""
     remedy = "give a list of Coupling, Drive, Rope or Distance"
     constraints = listed(constraints, (AbstractConstraint, Distance), "constraints", remedy)
     joints = listed(joints, AbstractJoint, "joints", "give a list of Revolute, Prismatic and their like")
@@ -107,7 +115,7 @@ def _listed(
 
 
 def _check_names(parts: Parts) -> dict[str, RigidBody]:
-    """The bodies by name, where all names are unique and all that elements refer to is there."""
+    """Check that names are unique and that all that elements refer to is there; return the bodies by name."""
     bodies, joints = _by_name(parts.bodies, "body"), _by_name(parts.joints, "joint")
     _by_name([*parts.joints, *parts.constraints], "joint or constraint")
     _check_references(bodies, joints, parts.constraints, parts.forces)
@@ -115,7 +123,7 @@ def _check_names(parts: Parts) -> dict[str, RigidBody]:
 
 
 def _spanning_tree(bodies: list[str], parts: Parts) -> SpanningTree:
-    """The tree, with joints in it that a constraint relates or a force acts along, where they can be."""
+    """Find the tree, with joints in it that a constraint relates, and where possible those that a force acts along."""
     related = {name for constraint in parts.constraints for name in constraint.joints}
     acted_on = {name for force in parts.forces for name in force.joints}
     tree = spanning_tree(bodies, parts.joints, [*tree_joints_first(parts.joints), related, acted_on])
@@ -189,7 +197,7 @@ def _check_references(
 
 
 def _check_index(what: str, joint: AbstractJoint, index: int | None, needs_coordinate: bool) -> None:
-    """Whether a joint has a speed of that index, and if need be a coordinate whose rate it is."""
+    """Check that a joint has a speed of that index, and where needed a coordinate whose rate it is."""
     count = len(joint.speed_units)
     kind = f"joint {joint.name!r}, a {type(joint).__name__}"
     if index is None and count != 1:

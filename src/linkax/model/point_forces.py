@@ -32,7 +32,7 @@ class _BetweenPoints(AbstractForce):
 
     @abc.abstractmethod
     def pull(self, motion: Motion) -> Float[Array, "3"]:
-        """The force on the first point; its opposite acts on the second [N]."""
+        """Compute the force on the first point [N]; its opposite acts on the second."""
 
     def load(self, t: Number, motion: Motion) -> Load:
         force = self.pull(motion)
@@ -40,15 +40,15 @@ class _BetweenPoints(AbstractForce):
 
 
 def _unit(vector: Float[Array, "3"]) -> Float[jax.Array, "3"]:
-    """The direction of a vector; zero for none."""
+    """Divide a vector by its length; zero stays zero."""
     square = dot(vector, vector)
     return jnp.where(square > 0.0, vector / jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
 class Spring(_BetweenPoints):
-    """A linear spring between two points; it pulls with stiffness × (distance − free_length).
+    """A linear spring between two points, with the pull stiffness × (distance − free_length).
 
-    Where the points meet it has no direction, and a free length pushes nowhere.
+    Where the points meet there is no direction, and it does not push.
 
     **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`;
     `stiffness` [N/m]; `free_length` [m], zero or more.
@@ -73,9 +73,9 @@ class Spring(_BetweenPoints):
 
 
 class Damper(_BetweenPoints):
-    """Viscous damping between two points: pulls with `damping` [N s/m] × the rate of their distance.
+    """Viscous damping between two points, with the pull damping × rate of their distance.
 
-    `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
+    **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`; `damping` [N s/m].
     """
 
     damping: Scalar
@@ -91,7 +91,7 @@ class Damper(_BetweenPoints):
 
 
 class _OnPoint(AbstractForce):
-    """A vector on a point of a body, in ground axes or in those of the frame there."""
+    """A vector on a point of a body, in ground axes or in those of the frame at the point."""
 
     point: Frame
     axes: Axes = eqx.field(static=True)
@@ -120,7 +120,9 @@ class PointForce(_OnPoint):
 
     - `point`: a body (its reference frame), or `body.at(...)`.
     - `force`: three numbers [N], or a function (t, motion) ↦ three numbers; see `JointTorque`.
-    - `axes`: "ground" (default), or "frame": those of the frame at the point, which turn with it.
+    - `axes`: "ground" (default), or "frame": those of the frame at the point, which turn with the body.
+
+    **Raises:** `ValueError` for a point on the ground.
     """
 
     force: Float[Array, "3"] | Law
@@ -134,9 +136,9 @@ class PointForce(_OnPoint):
 
 
 class PointMoment(_OnPoint):
-    """A moment on a body; on a beam, on its section at the point.
+    """A moment on a body, or on the section of a beam at a point.
 
-    **Arguments:** like those of `PointForce`, with `moment`: three numbers [N m], or a function.
+    **Arguments:** those of `PointForce`, with `moment`: three numbers [N m], or a function, in place of `force`.
     """
 
     moment: Float[Array, "3"] | Law

@@ -1,4 +1,4 @@
-"""Ropes over points of bodies: of a given length, or elastic."""
+"""Ropes over points of bodies, of given length or elastic."""
 
 from collections.abc import Callable, Iterable
 from itertools import pairwise
@@ -32,7 +32,7 @@ def _points(points: Iterable[BodyOrFrame], what: str) -> Points:
 
 
 def _spans(configuration: Configuration, points: Points) -> Float[jax.Array, "n 3"]:
-    """From each point to the next [m]."""
+    """Compute the vectors from each point to the next [m]."""
     ends = pairwise(points)
     return jnp.stack([configuration.between(first, second) for first, second in ends])
 
@@ -48,7 +48,7 @@ def _rate(motion: Motion, points: Points) -> Float[Array, "n 3"]:
 
 
 def _pull(configuration: Configuration, points: Points, tension: Number) -> Load:
-    """What a rope does to its points."""
+    """Compute the load of a rope on its points."""
     forces = tension * _directions(_spans(configuration, points))
     total = Load.none(configuration.system)
     for first, second, force in zip(points, points[1:], forces, strict=False):
@@ -59,18 +59,19 @@ def _pull(configuration: Configuration, points: Points, tension: Number) -> Load
 class Rope(AbstractConstraint):
     """A rope, without mass and friction, that stays taut over points (small sheaves); or a strut between two.
 
-    `Rope("hoist", [winch, boom.at("tip"), hook], length=30.0)` keeps the way from point to point at that length.
-    Its reaction is the tension [N]; a negative one says that a rope would be slack, or a strut is pressed.
-    It carries no body: each body needs joints to ground besides.
+    `Rope("hoist", [winch, boom.at("tip"), hook], length=30.0)` keeps the sum of the distances from point to point
+    at 30 m. Its reaction is the tension [N]; where that is negative, a rope would be slack, and a strut is pressed.
+    It carries no body: each body needs joints that connect it to ground.
 
     **Arguments:**
 
     - `name`: unique among joints and constraints.
     - `points`: two or more bodies (their reference frames), `body.at(...)`, or `lx.GROUND.at(...)`, in order.
-    - `length`: [m], a number, or a function of time t [s], twice differentiable: a winch, or a driven cylinder. What
-      the function reads is as for `Drive`.
+    - `length`: [m], a number, or a function of time t [s], twice differentiable, for a winch or a driven cylinder.
+      What the function may read is as for `Drive`.
 
-    **Raises:** `ValueError` for fewer than two points, all of them on one body, or a length that is not positive.
+    **Raises:** `ValueError` for fewer than two points, for points that are all on one body, and for a length that is
+    not positive.
     """
 
     points: Points
@@ -103,15 +104,15 @@ class Rope(AbstractConstraint):
         return Rope(self.name, self.points, length)
 
     def value(self, configuration: Configuration) -> Scalar:
-        """Minus its length: rows are such that their multipliers are tensions."""
+        """Compute minus its length [m]; with this sign its multiplier is the tension."""
         return -jnp.sum(length(_spans(configuration, self.points)))
 
     def load(self, configuration: Configuration, tension: Number) -> Load:
-        """What it does to its points."""
+        """Compute its load on its points at a tension [N]."""
         return _pull(configuration, self.points, tension)
 
     def bias(self, motion: Motion) -> Scalar:
-        """The acceleration of its length that velocities alone cause [m/s²]."""
+        """Compute the part of its length's acceleration that velocities alone cause [m/s²]."""
         spans, rate = _spans(motion.configuration, self.points), _rate(motion, self.points)
         points = jnp.stack([motion.point_bias(point) for point in self.points])
         along, size = _directions(spans), length(spans)
@@ -120,12 +121,15 @@ class Rope(AbstractConstraint):
 
 
 class ElasticRope(AbstractForce):
-    """An elastic rope, without mass and friction, over points (small sheaves); slack where it is too long.
+    """An elastic rope, without mass and friction, over points (small sheaves). It pulls, and never pushes.
 
-    It pulls with `stiffness` [N/m] (E A over the free length) × stretch + `damping` [N s/m] × rate of stretch, and
-    never pushes. With damping its pull jumps where it goes taut. Steps end where it goes taut and slack.
+    Taut, it has the tension stiffness × stretch + damping × rate of stretch. With damping the tension jumps where it
+    goes taut. Steps end where it goes taut or slack.
 
-    **Arguments:** `points`: see `Rope`; `stiffness`; `free_length` [m]; `damping`.
+    **Arguments:** `points`: see `Rope`; `stiffness` [N/m], E A / free_length; `free_length` [m]; `damping` [N s/m].
+
+    **Raises:** `ValueError` as for `Rope`, for a stiffness or free length that is not positive, and for a negative
+    damping.
     """
 
     points: Points
@@ -151,7 +155,7 @@ class ElasticRope(AbstractForce):
         return jnp.sum(dot(along, _rate(motion, self.points)))
 
     def switch(self, t: Number, motion: Motion) -> Scalar:
-        """Positive where it is taut: longer than free, and not shortening so fast that damping takes all its pull."""
+        """Positive where it is taut: longer than free, and not shortening so fast that damping cancels the pull."""
         stretch = self._stretch(motion.configuration)
         slower = self.damping / self.stiffness * self._rate_of_stretch(motion)
         return (stretch + jnp.minimum(slower, 0.0)) / self.free_length

@@ -8,7 +8,7 @@ from linkax.model.joints.joint import AbstractJoint
 
 
 class SpanningTree(NamedTuple):
-    """Names of the bodies from ground outwards, the joint and the predecessor that carry each, and the cut joints."""
+    """Names of the bodies from ground outwards, the joint and the predecessor of each, and the cut joints."""
 
     bodies: list[str]
     carriers: list[AbstractJoint]
@@ -17,9 +17,9 @@ class SpanningTree(NamedTuple):
 
 
 def spanning_tree(bodies: list[str], joints: list[AbstractJoint], first: list[set[str]]) -> SpanningTree:
-    """Choose the tree: joints named in the sets of `first`, in their order, then breadth first from ground.
+    """Find a spanning tree: joints named in the sets of `first`, in this order, then breadth first from ground.
 
-    Joints of types that cannot carry a body are cut always.
+    A joint whose type cannot carry a body is always cut.
 
     **Raises:** `ValueError` for a body that no joint connects to ground, and for a joint with
     `cut=True` that closes no loop.
@@ -59,14 +59,14 @@ def _neighbours(joints: list[AbstractJoint]) -> dict[str, list[tuple[AbstractJoi
 
 
 def _by_rank(joints: list[AbstractJoint], first: list[set[str]]) -> list[AbstractJoint]:
-    """Those named in the sets of `first`, then those of the breadth-first tree, then the rest."""
+    """Sort joints: those named in the sets of `first`, those of the breadth-first tree, the rest."""
     _, carriers, _ = _from_ground(joints)
     sets = [*first, {joint.name for joint in carriers}]
     return sorted(joints, key=lambda joint: [joint.name not in names for names in sets])
 
 
 def _from_ground(joints: list[AbstractJoint]) -> tuple[list[str], list[AbstractJoint], list[str]]:
-    """Walk the joints breadth first: bodies in order, the joint and the body that led to each."""
+    """Walk breadth first from ground: bodies in order, the joint and the body that lead to each."""
     neighbours, queue = _neighbours(joints), deque([GROUND_NAME])
     reached, carriers, predecessors = {GROUND_NAME: None}, [], []
     while queue:

@@ -1,4 +1,4 @@
-"""From the graph of bodies and joints to a spanning tree and cut joints. Names and indices only."""
+"""The plan of a mechanism: its tree, its loops, and where coordinates and rows lie. Names and indices only."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,10 +15,11 @@ GROUND_INDEX = -1
 
 
 class JointGroup(NamedTuple):
-    """Joints in the tree that move in the same way, by as many coordinates.
+    """Joints in the tree that move in the same way, by equally many coordinates.
 
-    - `motion`: the type of the joints, or their `motion` where it has one.
-    - `bodies`: those that they carry. `coordinates`: where in q the coordinates lie that move each, (n, k).
+    - `motion`: the type of the joints, or its `motion` where it has one.
+    - `bodies`: the bodies that they carry.
+    - `coordinates`: indices in q of the coordinates that move each, (n, k).
     """
 
     motion: type[AbstractJoint] | RelativeMotion
@@ -28,25 +29,25 @@ class JointGroup(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Topology:
-    """The static plan of a mechanism; equal plans share their compiled programs.
+    """The static plan of a mechanism. Equal plans share compiled programs.
 
-    Bodies are numbered from ground outwards, joint i < len(bodies) is the tree joint that
-    carries body i, and the cut joints follow. Ground has index -1.
+    Bodies are numbered from ground outwards; ground has index -1. Joint i < len(bodies) carries body i in the
+    tree, and the cut joints follow.
 
     - `predecessor`: the body that carries each body in the tree.
-    - `parent`, `child`: bodies of each joint as it was declared.
-    - `joint_types`: class of each joint, or what else says the same of it (see `AbstractJoint.kind`).
-    - `driven_by`: for each joint whose motion depends on other coordinates than its own, what they are
-      coordinates of, its own among them; None for the rest.
-    - `rotation_rows`: (cut joint, i, j) of each loop row h₁ⁱ·h₂ʲ, `translation_rows`:
-      (cut joint, i) of each loop row h₁ⁱ·s; cut joints and axes counted from 0. Rows that
-      vanish identically are left out here, and kept in `immobile_rotation_rows` and
-      `immobile_translation_rows`.
-    - `constraints`: names of the constraints on coordinates of the tree, a row each, and
-      `constraint_terms`: whose coordinates each one relates. `constraint_bodies`: those that it attaches to.
+    - `parent`, `child`: the bodies of each joint as declared.
+    - `joint_types`: the class of each joint, or its `JointKind` (see `AbstractJoint.kind`).
+    - `driven_by`: for each joint that other coordinates than its own move, the terms of all that move it; None for
+      other joints.
+    - `rotation_rows`: (cut joint, i, j) of each loop row h₁ⁱ·h₂ʲ; cut joints and axes counted from 0.
+    - `translation_rows`: (cut joint, i) of each loop row h₁ⁱ·s.
+    - `immobile_rotation_rows`, `immobile_translation_rows`: rows that no motion changes, which are left out of these.
+    - `constraints`: names of the constraints on coordinates of the tree, one row each.
+    - `constraint_terms`: the terms that each constraint relates.
+    - `constraint_bodies`: the bodies that each constraint attaches to.
 
-    Rows of the loop constraints: rotation rows, translation rows, a combined row for each cut
-    joint whose type has one, and those of `constraints`.
+    The loop constraints have rotation rows, translation rows, a combined row for each cut joint whose type has
+    one, and the rows of `constraints`, in this order.
     """
 
     bodies: tuple[str, ...]
@@ -66,6 +67,7 @@ class Topology:
 
     @property
     def num_bodies(self) -> int:
+        """n_b."""
         return len(self.bodies)
 
     @cached_property
@@ -75,32 +77,34 @@ class Topology:
 
     @property
     def num_cuts(self) -> int:
+        """Number of cut joints."""
         return len(self.joints) - len(self.bodies)
 
     @property
     def num_rows(self) -> int:
+        """Number of rows of the loop constraints."""
         plain = len(self.rotation_rows) + len(self.translation_rows)
         return plain + len(self.combining) + len(self.constraints)
 
     @property
     def num_immobile_rows(self) -> int:
-        """Loop rows that no motion changes."""
+        """Number of loop rows that no motion changes."""
         return len(self.immobile_rotation_rows) + len(self.immobile_translation_rows)
 
     @cached_property
     def combining(self) -> tuple[int, ...]:
-        """The cut joints with a combined row, counted from 0."""
+        """Cut joints with a combined row, counted from 0."""
         kinds = self.joint_types[self.num_bodies :]
         return tuple(i for i, kind in enumerate(kinds) if kind.combined_rotations or kind.combined_translations)
 
     @cached_property
     def coordinates(self) -> dict[str, slice]:
-        """The coordinates of each tree joint in q."""
+        """Where the coordinates of each tree joint lie in q."""
         return self._slices(lambda kind: len(kind.speed_units) + kind.has_quaternion)
 
     @cached_property
     def speeds(self) -> dict[str, slice]:
-        """The speeds of each tree joint in v."""
+        """Where the speeds of each tree joint lie in v."""
         return self._slices(lambda kind: len(kind.speed_units))
 
     def _slices(self, count: Callable[[type[AbstractJoint] | JointKind], int]) -> dict[str, slice]:
@@ -111,11 +115,11 @@ class Topology:
         return slices
 
     def column(self, term: Term) -> int:
-        """Where in v the speed of a term lies, of a joint in the tree."""
+        """Find the index in v of the speed of a term; its joint must be in the tree."""
         return self.speeds[term.joint].start + (term.index or 0)
 
     def coordinate_slice(self, term: Term) -> slice:
-        """Where in q the coordinates of a term lie, of a joint in the tree."""
+        """Find where in q the coordinates of a term lie; its joint must be in the tree."""
         taken = self.coordinates[term.joint]
         if term.index is None:
             return taken
@@ -123,7 +127,7 @@ class Topology:
         return slice(place, place + 1)
 
     def columns(self, body: int) -> np.ndarray:
-        """Where in v the speeds lie that move a body on its predecessor."""
+        """Find the indices in v of the speeds that move a body on its predecessor."""
         driven_by, taken = self.driven_by[body], self.speeds[self.joints[body]]
         if driven_by is None:
             return np.arange(taken.start, taken.stop)
@@ -131,7 +135,7 @@ class Topology:
 
     @cached_property
     def motions(self) -> np.ndarray:
-        """All pairs of a body and a speed that moves it on its predecessor, (n_m, 2), in the order of bodies."""
+        """Pairs of a body and the index in v of a speed that moves it on its predecessor, (n_m, 2), by body."""
         pairs = [(body, column) for body in range(self.num_bodies) for column in self.columns(body)]
         return np.array(pairs, dtype=int).reshape(-1, 2)
 
@@ -142,7 +146,7 @@ class Topology:
 
     @cached_property
     def motion_column(self) -> np.ndarray | None:
-        """The speeds of `motions`, (n_m,); None where each speed moves one body, so that they are in order."""
+        """The indices in v of `motions`, (n_m,); None where they are 0, 1, …, as each speed moves one body."""
         columns = self.motions[:, 1]
         return None if np.array_equal(columns, np.arange(self.num_speeds)) else columns
 
@@ -158,7 +162,7 @@ class Topology:
 
     @cached_property
     def quaternions(self) -> np.ndarray:
-        """Where in q each quaternion lies, and where in v its angular velocity begins, (n, 2)."""
+        """Indices where each quaternion begins in q, and its angular velocity in v, (n, 2)."""
         kinds = zip(self.joints[: self.num_bodies], self.joint_types, strict=False)
         starts = [
             (self.coordinates[name].start, self.speeds[name].start) for name, kind in kinds if kind.has_quaternion
@@ -167,7 +171,7 @@ class Topology:
 
     @cached_property
     def plain(self) -> np.ndarray:
-        """Where in q and in v the coordinates lie whose rates are speeds, (n, 2)."""
+        """Indices in q and in v of coordinates whose rates are speeds, (n, 2)."""
         q, v = np.arange(self.num_coordinates), np.arange(self.num_speeds)
         turning = self.quaternions[:, None, :]
         in_q, in_v = turning[..., 0] + np.arange(4), turning[..., 1] + np.arange(3)
@@ -175,7 +179,7 @@ class Topology:
 
     @cached_property
     def joint_groups(self) -> tuple["JointGroup", ...]:
-        """The joints in the tree by what their motion is."""
+        """The joints in the tree, grouped by their motion."""
         of_motion = {}
         for body, kind in enumerate(self.joint_types[: self.num_bodies]):
             driven_by = self.driven_by[body]
@@ -195,17 +199,17 @@ class Topology:
 
     @cached_property
     def slides(self) -> np.ndarray:
-        """Which speeds are of lengths [m/s], shape (n_v,)."""
+        """Which speeds are in m/s, (n_v,)."""
         kinds = self.joint_types[: self.num_bodies]
         return np.array([unit == "m" for kind in kinds for unit in kind.speed_units], dtype=bool)
 
     def _moving(self, bodies: np.ndarray) -> np.ndarray:
-        """The speeds that move some of the bodies on their predecessors, (n_b,) not zero."""
+        """Find the speeds that move bodies on their predecessors; `bodies`, (n_b,), is not zero for these."""
         return np.unique(self.motions[bodies[self.moved_body] != 0.0, 1])
 
     @cached_property
     def read_by_rows(self) -> tuple[np.ndarray, ...]:
-        """The speeds that each loop row can depend on."""
+        """Indices in v of the speeds that each loop row can depend on."""
         around = [self._moving(bodies) for bodies in self.loop]
         of_constraints = [
             np.unique([*map(self.column, terms), *(c for body in bodies for c in self._moving(self.path[body]))])
@@ -216,19 +220,19 @@ class Topology:
 
     @cached_property
     def coupled_by_inertia(self) -> tuple[np.ndarray, ...]:
-        """Sets of speeds between which the mass matrix has entries: those on the way from ground to each body."""
+        """Sets of speeds that the mass matrix couples: those on the way from ground to each body."""
         return tuple(self._moving(on_path) for on_path in self.path[:-1])
 
     @cached_property
     def reversed(self) -> np.ndarray:
-        """Tree joints that the tree runs through from child to parent, shape (n_b,)."""
+        """Which tree joints lead from child to parent, away from ground, (n_b,)."""
         return np.array(self.predecessor) == np.array(self.child[: self.num_bodies])
 
     @cached_property
     def path(self) -> np.ndarray:
-        """path[i, j] = 1 where body j lies on the way from ground to body i, itself included.
+        """path[i, j] = 1 where body j is on the way from ground to body i, itself included; (n_b + 1, n_b).
 
-        Row -1, a row of zeros, is ground. Shape (n_b + 1, n_b).
+        Row -1, of ground, is zero.
         """
         path = np.zeros((self.num_bodies + 1, self.num_bodies))
         for body, carrier in enumerate(self.predecessor):
@@ -238,20 +242,20 @@ class Topology:
 
     @cached_property
     def loop(self) -> np.ndarray:
-        """+1 for tree joints from the loop's common ancestor to the cut joint's child, -1 to its parent."""
+        """+1 for tree joints from a loop's common ancestor to the cut joint's child, -1 to its parent, (n_cuts, n_b)."""
         cuts = slice(self.num_bodies, None)
         return self.path[list(self.child[cuts])] - self.path[list(self.parent[cuts])]
 
     @cached_property
     def root(self) -> np.ndarray:
-        """The first body on the way from ground to each body, -1 for ground, shape (n_b + 1,)."""
+        """The first body on the way from ground to each body, (n_b + 1,); -1 for ground."""
         root = np.full(self.num_bodies + 1, GROUND_INDEX)
         for body, carrier in enumerate(self.predecessor):
             root[body] = body if carrier == GROUND_INDEX else root[carrier]
         return root
 
     def describe(self) -> str:
-        """The spanning tree, the cut joints and the constraints on coordinates, a line for each."""
+        """Describe the spanning tree, the cut joints and the constraints on coordinates, a line for each."""
         lines = []
         for index, name in enumerate(self.joints):
             ends = [

@@ -1,1 +1,1 @@
-"""Joint types, one file each: their motion in the tree, and their constraint rows when cut."""
+"""Joint types, one file each: how a joint moves in the tree, and its constraint rows where it is cut."""

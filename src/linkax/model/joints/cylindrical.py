@@ -11,8 +11,8 @@ class Cylindrical(AbstractJoint):
     """A sleeve on a shaft: the child turns about h¹ and slides along it.
 
     Coordinates: angle [rad] from the parent's h² to the child's, right-handed about h¹, and
-    distance [m] of the child's frame from the parent's along h¹. Read from a cut joint the angle
-    lies in (−π, π].
+    distance [m] of the child's frame from the parent's along h¹. Where the joint is cut the
+    angle is in (−π, π].
     """
 
     speed_units = ("rad", "m")

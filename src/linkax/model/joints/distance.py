@@ -11,9 +11,9 @@ from linkax.xla.arrays import Array, Scalar
 class Distance(AbstractJoint):
     """A massless rod with a ball at each end, or a rope that stays taut, between two points.
 
-    It keeps the origins of two frames at a fixed distance and has no coordinate. It carries no
-    body: each body needs joints to ground besides. Its reaction on the child is a force along the
-    line between the two points, on the child towards the parent where the rod is pulled.
+    It keeps the origins of two frames `length` apart and has no coordinate. It carries no body: each body needs
+    other joints that connect it to ground. Its reaction on the child is a force along the line between the points,
+    towards the parent where the rod is pulled.
 
     **Arguments:** `name`, unique among joints and constraints; `parent`, `child`: a body (its
     reference frame), `body.at(...)`, or `lx.GROUND`; `length` [m].

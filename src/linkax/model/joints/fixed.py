@@ -8,7 +8,7 @@ from linkax.xla.arrays import Array
 
 
 class Fixed(AbstractJoint):
-    """A weld: the child keeps its place and its orientation on the parent. No coordinate."""
+    """A weld: the child keeps its position and orientation on the parent. It has no coordinate."""
 
     speed_units = ()
     angular_subspace = ()

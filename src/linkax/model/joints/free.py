@@ -9,12 +9,12 @@ from linkax.xla.arrays import Array
 
 
 class Free(AbstractJoint):
-    """No joint at all: the child moves freely, and its motion is measured from the parent.
+    """No constraint: the child moves freely, and its motion is measured from the parent.
 
     Coordinates: unit quaternion (w, x, y, z) of the child's frame in the parent's, and the position
     [m] of its origin in the parent's frame. Speeds: angular velocity relative to the parent
     [rad/s], and velocity of the child's origin seen from the parent [m/s], both in axes of the
-    parent's frame. Read from a cut joint, w ≥ 0.
+    parent's frame. Where the joint is cut, w ≥ 0.
     """
 
     speed_units = ("rad", "rad", "rad", "m", "m", "m")

@@ -1,4 +1,4 @@
-"""What every joint type says of itself."""
+"""What a joint type defines."""
 
 import abc
 import dataclasses
@@ -23,17 +23,17 @@ class RelativeMotion(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, coordinates: Float[Array, " n"], parameters: Float[Array, " k"]) -> Float[jax.Array, "4 4"]:
-        """The child's frame seen from the parent's, in joint axes, (4, 4), see `linkax.spatial.screws`.
+        """Compute the child's frame in the parent's, in joint axes, (4, 4), see `linkax.spatial.screws`.
 
-        Of joints with the same motion that have fewer coordinates than others, the last ones may be given as zero.
+        Joints with the same motion may have fewer coordinates than others; their last ones are then given as zero.
         """
 
 
 @dataclasses.dataclass(frozen=True)
 class JointKind:
-    """What a topology keeps of a joint in the tree that has a `RelativeMotion`; compared by value.
+    """What a topology keeps of a joint in the tree that has a `RelativeMotion`, compared by value.
 
-    It says what the class of another joint says of itself, see `AbstractJoint`.
+    Its attributes are those that other joints have as class attributes, see `AbstractJoint`.
     """
 
     name: str
@@ -48,36 +48,36 @@ class JointKind:
 
     @property
     def __name__(self) -> str:
+        """Its name, as of a class."""
         return self.name
 
 
 class AbstractJoint(eqx.Module):
     """A joint between a frame on a parent and a frame on a child body.
 
-    The two frames coincide in orientation at coordinate zero. The joint's axes h¹, h², h³ are
-    fixed in each of them, h¹ along `axis`, which is given in the parent's frame. Coordinates
-    and speeds are those of the child relative to the parent: turns first, then displacements.
+    Both frames have the same orientation at coordinate zero. The joint's axes h¹, h², h³ are fixed in each of
+    them, with h¹ along `axis`, given in the parent's frame. Coordinates and speeds are those of the child relative to
+    the parent: turns first, then displacements.
 
-    A joint type is this class with its static facts filled in. In the spanning tree it turns
-    the child by `rotation` and moves it along `linear_subspace`, both in joint axes. Cut, it
-    locks `locked_rotations` and `locked_translations` (Table 1 of the paper), and `measure`
-    reads its coordinates. A type with no numbers of its own says `__init__ = AbstractJoint.__init__`,
-    without which type checkers expect its fields as arguments.
+    A joint type is a subclass that fills in the class attributes. In the spanning tree it turns the child by
+    `rotation` and moves it along `linear_subspace`, both in joint axes. Cut, it locks `locked_rotations` and
+    `locked_translations` (Table 1 of the paper), and `measure` reads its coordinates. A type without numbers of its
+    own sets `__init__ = AbstractJoint.__init__`; otherwise type checkers take its fields for arguments.
     """
 
     # Units of the speeds, one for each: "rad" or "m" (per second).
     speed_units: ClassVar[tuple[str, ...]]
     # Coordinates begin with a unit quaternion, whose rate is the angular velocity of the first three speeds.
     has_quaternion: ClassVar[bool] = False
-    # Columns of the motion subspace in joint axes of the parent, angular and linear part. The
-    # angular part is that at coordinate zero where `angular_subspace_at` says otherwise.
+    # Columns of the motion subspace in joint axes of the parent, angular and linear part. With an
+    # `angular_subspace_at` the angular part is that at coordinate zero.
     angular_subspace: ClassVar[tuple[tuple[float, float, float], ...]]
     linear_subspace: ClassVar[tuple[tuple[float, float, float], ...]]
-    # The linear part is to be multiplied by `parameter`.
+    # Whether the linear part is multiplied by `parameter`.
     is_screw: ClassVar[bool] = False
-    # The angular part for joints whose axes turn with their own coordinates: (coordinates) -> (n, 3).
+    # Angular part of a joint whose axes turn with its own coordinates: (coordinates) -> (n, 3).
     angular_subspace_at: ClassVar[Callable[[Array], jax.Array] | None] = None
-    # All of the motion, for joints that bend with other coordinates than their own; see `RelativeMotion`.
+    # All of the motion of a joint that moves with other coordinates than its own, see `RelativeMotion`.
     motion: ClassVar[RelativeMotion | None] = None
     # Pairs (i, j), counted from 0, of axes that stay orthogonal: parent's hⁱ and child's hʲ.
     locked_rotations: ClassVar[tuple[tuple[int, int], ...]]
@@ -88,7 +88,7 @@ class AbstractJoint(eqx.Module):
     # One row more, of h₁ⁱ·h₂ʲ for these pairs and h₁ⁱ·s/ℓ for these axes together, by `combined`.
     combined_rotations: ClassVar[tuple[tuple[int, int], ...]] = ()
     combined_translations: ClassVar[tuple[int, ...]] = ()
-    # False for what only ever closes loops.
+    # False for a type that only closes loops.
     can_carry: ClassVar[bool] = True
 
     name: str = eqx.field(static=True)
@@ -112,11 +112,14 @@ class AbstractJoint(eqx.Module):
 
         - `name`: unique in the mechanism.
         - `parent`, `child`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
-        - `axis`: h¹ in the parent's frame: "x", "-y", …, three numbers (both part of the
-          structure), or a JAX array (traced). Need not be normalised.
-        - `second_axis`: h² likewise, at a right angle to h¹. Default: the one that gives
-          coordinate frames where h¹ is a coordinate axis, in cyclic order.
+        - `axis`: h¹ in the parent's frame: a name "x", "-y", … or three numbers, which are structure, or a JAX
+          array, which is traced. Its length is any but zero.
+        - `second_axis`: h², given likewise, at a right angle to h¹. By default, where h¹ is a coordinate axis, h²
+          is the next one in cyclic order: z for y, -z for -y.
         - `cut`: keep this joint out of the spanning tree; it must close a loop.
+
+        **Raises:** `ValueError` for an empty name, one body as both, an axis of length zero, and axes that are not
+        at a right angle.
         """
         if not isinstance(name, str) or not name:
             raise ValueError(f"joint name is {name!r}; give a non-empty string")
@@ -134,36 +137,36 @@ class AbstractJoint(eqx.Module):
 
     @property
     def num_coordinates(self) -> int:
-        """Number of coordinates: of speeds, and one more where a quaternion is among them."""
+        """Number of coordinates: one for each speed, and one more with a quaternion."""
         return len(self.speed_units) + self.has_quaternion
 
     @property
     def kind(self) -> "type[AbstractJoint] | JointKind":
-        """What a topology keeps of this joint: its type, or what says the same of it."""
+        """What a topology keeps of this joint: its class, or a `JointKind`."""
         return type(self)
 
     @property
     def driven_by(self) -> tuple[Term, ...] | None:
-        """Whose coordinates move it, in the order that its `motion` reads them; None for its own alone."""
+        """Terms whose coordinates move it, in the order that its `motion` reads; None where only its own do."""
         return None
 
     @property
     def parameters(self) -> Float[Array, " k"] | None:
-        """The numbers that its `motion` needs."""
+        """Numbers that its `motion` needs."""
         return None
 
     @property
     def length_estimate(self) -> Scalar | float:
-        """About how far its `motion` takes the child from the parent [m]."""
+        """Estimate of how far its `motion` takes the child from the parent [m]."""
         return 0.0
 
     @property
     def parameter(self) -> Scalar | None:
-        """The number of this joint that its type's rows or motion need (a length [m]), or None."""
+        """A length [m] that its rows or its motion need, such as a screw's pitch [m/rad], or None."""
         return None
 
     def frames(self) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
-        """The joint's axes as columns, in the parent's and in the child's body axes."""
+        """Return h¹, h², h³ as columns, in the parent's and in the child's body axes."""
         second = None if self.second_axis is None else value(self.second_axis)
         axes = frame_about_axis(value(self.axis), second)
         return value(self.parent.rotation) @ axes, value(self.child.rotation) @ axes
@@ -171,26 +174,26 @@ class AbstractJoint(eqx.Module):
     @staticmethod
     @abc.abstractmethod
     def rotation(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
-        """Axes of the child's frame in those of the parent's, as columns."""
+        """Compute the child's axes in those of the parent, as columns, from the coordinates."""
 
     @staticmethod
     @abc.abstractmethod
     def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[Array, " n"]:
-        """Coordinates from the child's axes and origin, both in joint axes of the parent."""
+        """Read the coordinates from the child's axes and origin, both in joint axes of the parent."""
 
     @staticmethod
     def combined(
         rotations: Float[Array, " r"], translations: Float[Array, " t"], parameter: Scalar
     ) -> Float[jax.Array, ""]:
-        """The row that combines others; `parameter` is the joint's own in units of ℓ."""
+        """Combine h₁ⁱ·h₂ʲ and h₁ⁱ·s/ℓ into one row; `parameter` is the joint's own, in units of ℓ."""
         raise NotImplementedError
 
 
 def hinged(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
-    """The `rotation` of a joint that turns about h¹ by its first coordinate."""
+    """Rotate about h¹ by the first coordinate."""
     return rotation_about_first_axis(coordinates[0])
 
 
 def unturned(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
-    """The `rotation` of a joint that does not turn."""
+    """Do not rotate."""
     return jnp.eye(3, dtype=coordinates.dtype)

@@ -11,8 +11,8 @@ class Planar(AbstractJoint):
     """A plate on a table: the child slides in the plane across h¹, and turns about h¹.
 
     Coordinates: angle [rad] from the parent's h² to the child's, right-handed about h¹, and the
-    distances [m] of the child's frame from the parent's along the parent's h² and h³. Read from a
-    cut joint the angle lies in (−π, π].
+    distances [m] of the child's frame from the parent's along the parent's h² and h³. Where the
+    joint is cut the angle is in (−π, π].
     """
 
     speed_units = ("rad", "m", "m")

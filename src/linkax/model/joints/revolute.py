@@ -9,8 +9,8 @@ from linkax.xla.arrays import Array
 class Revolute(AbstractJoint):
     """A hinge: the child turns about h¹.
 
-    Coordinate: angle [rad] from the parent's h² to the child's, right-handed about h¹. Read
-    from a cut joint it lies in (−π, π].
+    Coordinate: angle [rad] from the parent's h² to the child's, right-handed about h¹; in (−π, π] where the
+    joint is cut.
     """
 
     speed_units = ("rad",)

@@ -11,12 +11,11 @@ from linkax.xla.arrays import Array, Scalar
 
 
 class Screw(AbstractJoint):
-    """A nut on a screw: the child turns about h¹ and advances along it in proportion.
+    """A nut on a screw: the child turns about h¹ and advances along it by pitch × angle.
 
-    Coordinate: angle [rad] from the parent's h² to the child's, right-handed about h¹; the child's
-    frame is `pitch` times the angle along h¹ from the parent's. `pitch` [m/rad] is the advance
-    for one radian, 2π times smaller than the lead of a thread; positive for a right-handed one.
-    Cut, the joint may sit on any turn of its thread, and its angle lies in (−π, π].
+    Coordinate: angle [rad] from the parent's h² to the child's, right-handed about h¹. `pitch` [m/rad] is the
+    advance for one radian, lead / 2π, positive for a right-handed thread. Cut, the joint may be on any turn of its
+    thread, and its angle is in (−π, π].
 
     **Raises:** `ValueError` for a pitch of zero.
     """

@@ -12,7 +12,7 @@ class Spherical(AbstractJoint):
 
     Coordinates: unit quaternion (w, x, y, z) of the child's frame in the parent's, (1, 0, 0, 0)
     where the two coincide. Speeds: angular velocity of the child relative to the parent [rad/s],
-    in axes of the parent's frame. Read from a cut joint, w ≥ 0.
+    in axes of the parent's frame. Where the joint is cut, w ≥ 0.
     """
 
     speed_units = ("rad", "rad", "rad")
