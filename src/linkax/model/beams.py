@@ -1,10 +1,9 @@
-"""Flexible beams: what they are, and their elastic forces (`linkax.model.discretisation` takes them apart).
+"""Flexible beams and their elastic forces; `linkax.model.discretisation` takes beams apart.
 
-Strains of the axis are the coordinates, linear between nodes: the beam is geometrically exact, its
-elastic forces are linear in its coordinates, and a slender one neither shears nor stretches unless it
-is asked to. (Of the alternatives, nodes with absolute coordinates or corotated elements need
-constraints to join a tree of relative coordinates, and rigid segments with springs converge with the
-second order only, where strains that are linear between nodes converge with the sixth.)
+The coordinates of a beam are the strains of its axis, linear between nodes. The beam is geometrically exact, its
+elastic forces are linear in its coordinates, and a slender one shears and stretches only where asked to. (The
+alternatives: nodes with absolute coordinates and corotated elements need constraints to join a tree of relative
+coordinates; rigid segments with springs converge with the second order, strains linear between nodes with the sixth.)
 """
 
 from typing import Any, Literal
@@ -39,47 +38,52 @@ from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
 NUM_STRAINS = 6
-# Where an element has its mass, between its nodes: Gauss's rule with two points. (Its error and that of the strains
-# have opposite signs in frequencies; those of Simpson's rule have equal ones.)
+# Where an element has its mass, from 0 to 1: Gauss's rule with two points. (In frequencies its error and that of the
+# strains have opposite signs; the errors of Simpson's rule and of the strains have equal ones.)
 MASS_PLACES = np.array([0.5 - np.sqrt(1.0 / 12.0), 0.5 + np.sqrt(1.0 / 12.0)])
-# What a section needs against each component of strain.
+# What a section needs for each strain.
 STIFFNESSES = ("torsional_stiffness", *2 * ("bending_stiffness",), "axial_stiffness", *2 * ("shear_stiffness",))
-PLACED = 1e-9  # of an element: rounding of places at its ends
+PLACED = 1e-9  # rounding of places at the ends of an element, in its lengths
 
 
 class Place(Frame):
-    """A frame on a section of a beam, whose name is `body`, at offset[0] [m]; the section is in that element."""
+    """A frame on the section at offset[0] [m] of the beam named `body`.
+
+    - `element`: the element that this section is in, from 0.
+    """
 
     element: int = eqx.field(static=True)
 
 
 class Beam(AbstractBody):
-    """An initially straight, uniform, flexible body along its x axis, from frame "base" to "tip".
+    """A flexible body along its x axis, initially straight and uniform, from frame "base" to frame "tip".
 
-    Bending, torsion, stretch and shear of any size that the material's law, linear in the strains of the
-    axis, stands for (a geometrically exact beam: Reissner 1973, Simo 1985). Its coordinates, under its
-    name as of a joint, are the strains at the nodes times the length of an element, node by node, in the
-    order twist, bending about y, about z [rad], stretch, shear along y, along z [m], as many of them as
-    the beam has. Its mass is in two sections of each element (Gauss's rule).
+    It is geometrically exact (Reissner 1973, Simo 1985): bending, torsion, stretch and shear may be as large as a
+    material law holds that is linear in the strains of the axis. Its coordinates, found under its name like those of
+    a joint, are strain × element length at each node, node by node: twist, bending about y and z [rad], stretch,
+    shear along y and z [m], those of them that the beam has. Its mass is in two sections of each element (Gauss's
+    rule).
 
     **Arguments:**
 
     - `name`: unique in the mechanism, among joints too.
-    - `length` [m]; `section`: a `Section`.
-    - `elements`: number of elements. Errors of deflections fall with its sixth power, of frequencies with its fourth.
+    - `length` [m].
+    - `section`: a `Section`.
+    - `elements`: number n of elements. Errors of deflections fall as n⁻⁶, those of frequencies as n⁻⁴.
     - `bends`: axes about which it bends, "yz" (default), "y", "z" or "".
-    - `torsion`, `stretch`: whether it twists and stretches. Without, it is rigid against that, and motion
-      has no fast waves.
-    - `shear`: False for Euler and Bernoulli, True for Timoshenko; shear goes with the bending.
-    - `damping`: time [s] by which strain rates count as strains (Kelvin and Voigt): a mode of frequency ω
-      has the damping ratio ω damping / 2.
+    - `torsion`, `stretch`: whether it twists and stretches. Where it does not, it is rigid, and the motion has none
+      of these fast waves.
+    - `shear`: False for an Euler-Bernoulli beam, True for a Timoshenko beam, which shears in the directions in which
+      it bends.
+    - `damping`: time constant τ [s] of Kelvin-Voigt damping: elastic forces are those of strain + τ × strain rate,
+      and a mode of frequency ω has the damping ratio ω τ / 2.
 
-    Joints, forces and other bodies attach to `beam.at("tip")`, `beam.at(2.5)` (a section [m] from the
-    base) or `beam.at([x, y, z])` (a point off the axis, fixed to the section at x). Moments on sections
-    in the middle, which make the bending jump, are resolved best between two beams joined there by
-    `Fixed`.
+    Joints and forces attach to `beam.at("tip")`, to `beam.at(2.5)`, the section 2.5 m from the base, or to
+    `beam.at([x, y, z])`, a point off the axis that is fixed to the section at x. A moment on a section in the middle
+    makes the bending jump; two beams joined there by `Fixed` resolve it best.
 
-    **Raises:** `ValueError` for what cannot be, and for a section without the stiffness that a strain needs.
+    **Raises:** `ValueError` for a length that is not positive and a negative damping, for a beam without strains,
+    and for a section without the stiffness or inertia that a strain needs.
     """
 
     name: str = eqx.field(static=True)
@@ -129,10 +133,15 @@ class Beam(AbstractBody):
         return self.at("base")
 
     def at(self, where: str | Number | Vector, rotation: Matrix | None = None, *, element: int | None = None) -> Frame:
-        """A frame on this beam, with axes `rotation` in those of its section.
+        """Make a frame on this beam.
 
-        `where`: "base", "tip", a distance [m] from the base along the axis, or [x, y, z] off the axis.
-        `element`: in which element that is, counted from 0; needed where JAX traces the distance or the length.
+        **Arguments:**
+
+        - `where`: "base", "tip", a distance [m] from the base along the axis, or [x, y, z] off the axis.
+        - `rotation`: its axes as columns, in those of its section, shape (3, 3) (default: parallel).
+        - `element`: the element that it is in, from 0; needed where JAX traces the distance or the length.
+
+        **Raises:** `ValueError` for a place that is not on the beam, or not in that element.
         """
         axes = rotation_matrix(rotation, f"rotation of a frame on beam {self.name!r}")
         if isinstance(where, str):
@@ -154,7 +163,7 @@ class Beam(AbstractBody):
         return Place(self.name, self.within(offset, what), axes, element)
 
     def within(self, offset: Array, what: str, first: int = 0, last: int | None = None) -> Float[Array, "3"]:
-        """A place [x, y, z], checked to be between two nodes, by default the base and the tip."""
+        """Check that a place [x, y, z] is between two nodes, by default the base and the tip."""
         begin, end = (node * self.element_length for node in (first, self.elements if last is None else last))
         slack = PLACED * self.element_length
         inside = lambda place: ((place[0] >= begin - slack) & (place[0] <= end + slack)).all()
@@ -162,14 +171,15 @@ class Beam(AbstractBody):
 
     @property
     def element_length(self) -> Scalar:
-        """[m]."""
+        """Length of an element [m]."""
         return self.length / self.elements
 
     @property
     def fastest_frequency(self) -> Scalar:
-        """Of its natural frequencies the highest, about [rad/s]: of waves as short as its elements.
+        """Estimate of its highest natural frequency [rad/s], that of waves as short as an element.
 
-        Masses that it carries lower that little. Factors as found for beams of 2 to 8 elements, within a third.
+        Its factors were found for beams of 2 to 8 elements, and hold within a third. Masses that the beam carries
+        hardly lower this frequency.
         """
         section, order = self.section, 5.5 / self.element_length
         about, turning = section.bending_stiffness, section.rotary_inertia
@@ -189,21 +199,21 @@ class Beam(AbstractBody):
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """Names of the sections at its nodes, from the base to the tip."""
+        """Names of the sections at nodes, from the base to the tip."""
         return tuple(self.section_name(node) for node in range(self.elements + 1))
 
     @property
     def sections(self) -> tuple[str, ...]:
-        """Names of its sections: nodes, and where it has its mass between them, counted in elements from the base."""
+        """Names of all sections from the base to the tip: those at nodes, and those that have the mass between them."""
         places = np.add.outer(np.arange(self.elements), [0.0, *MASS_PLACES]).reshape(-1)
         return tuple(self.section_name(place) for place in (*places, self.elements))
 
     def section_name(self, place: float | int) -> str:
-        """The name of the section at a place, counted in elements from the base."""
+        """Name the section at a place, which is counted in elements from the base."""
         return f"{self.name}[{np.round(place, 2):g}]"
 
     def strain(self, coordinates: Float[Array, "*batch coordinates"]) -> Float[jax.Array, "*batch nodes 6"]:
-        """Strains at the nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
+        """Compute the strains at nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
         of_nodes = coordinates.reshape(*coordinates.shape[:-1], self.elements + 1, len(self.strains))
         found = jnp.zeros((*of_nodes.shape[:-1], NUM_STRAINS), coordinates.dtype)
         length = jnp.reshape(jnp.asarray(self.length), (*np.shape(self.length), 1, 1, 1)[-coordinates.ndim - 1 :])
@@ -211,9 +221,9 @@ class Beam(AbstractBody):
 
 
 class BeamElasticity(AbstractForce):
-    """The elastic and damping forces of a beam: −K (q + damping × v), K constant.
+    """The elastic and damping forces of a beam, −K (q + damping × v), where K is constant.
 
-    - `stiffness`: of each component of strain, for a coordinate of the whole element [N m/rad or N/m].
+    - `stiffness`: that of an element for each strain, by its coordinate [N m/rad or N/m].
     """
 
     beam: str = eqx.field(static=True)
@@ -232,9 +242,9 @@ class BeamElasticity(AbstractForce):
         return (Term(self.beam, 0),)
 
     def _forces(self, coordinates: Float[Array, " n"]) -> Float[jax.Array, " n"]:
-        """K q: strains that are linear between nodes, squared and integrated.
+        """Compute K q, the gradient of the elastic energy of strains that are linear between nodes.
 
-        Their second differences count a little less, so that waves have the right speed to one order more.
+        Second differences of strains count a little less, which makes the speed of waves accurate to one order more.
         """
         count = self.elements + 1
         weights = np.diag([1.0 / 3.0, *(count - 2) * [2.0 / 3.0], 1.0 / 3.0])
@@ -256,7 +266,7 @@ class BeamElasticity(AbstractForce):
         return jax.vmap(self._forces)(jnp.eye((self.elements + 1) * len(self.stiffness)))
 
     def energy(self, coordinates: Float[Array, " n"]) -> Scalar:
-        """Of its coordinates [J]."""
+        """Compute the elastic energy [J] at its coordinates, qᵀ K q / 2."""
         return coordinates @ self._forces(coordinates) / 2.0
 
     def potential_energy(self, configuration: Configuration) -> Scalar:

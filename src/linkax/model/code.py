@@ -1,9 +1,9 @@
-"""Functions of users, compared by what they compute: by their code and all that it reads.
+"""Compare users' functions by their code and all that it reads.
 
-JAX compares functions by identity. One that is made anew, such as a `lambda` in a function that builds a mechanism,
-is another one to it, and all programs are compiled anew. Here two functions are the same where their code, defaults,
-and the values that they close over and read as globals are; JAX arrays that they close over are numbers, taken out.
-Where that cannot be decided, a function is the same as itself alone.
+JAX compares functions by identity. A function made anew, such as a `lambda` in a function that builds a mechanism,
+is a new one to JAX, which compiles all programs again. Here two functions are equal where their code, their defaults,
+and the values that they close over and read as globals are equal. JAX arrays that they close over are numbers, which
+are taken out. A function that cannot be compared equals itself alone.
 """
 
 import types
@@ -18,7 +18,7 @@ from linkax.model.code_walk import Maker, Same, Undecided, Walk
 
 
 class Code:
-    """A function without its numbers; equal to that of another function that computes the same of the same numbers."""
+    """A function without its numbers. Functions that compute the same from the same numbers have equal code."""
 
     function: Callable[..., Any]
     _key: Any
@@ -28,14 +28,14 @@ class Code:
 
     @staticmethod
     def of(function: Callable[..., Any]) -> "tuple[Code, tuple[jax.Array, ...]]":
-        """The code of a function, and its numbers.
+        """Split a function into its code and its numbers.
 
-        Numbers are JAX arrays, and in pytrees such as `jax.tree_util.Partial` and `equinox.Module` also
-        NumPy's and floats.
+        Numbers are JAX arrays; in pytrees such as `jax.tree_util.Partial` and `equinox.Module` they are NumPy arrays
+        and floats too.
         """
         code, walk = Code(), Walk(())
         try:
-            # Again, until the attributes of what is read are looked up by the names in all code that is reached.
+            # Code that is reached may name further attributes of what is read; again, until there are none.
             while True:
                 names, walk = walk.names, Walk(walk.names)
                 key, code._made = walk.part(function, not isinstance(function, types.FunctionType))
@@ -45,7 +45,7 @@ class Code:
             walk, key, code._made = Walk(()), Same(function), lambda _: function
         code.function, code._key, code._hash = function, key, hash(key)
         code._arrays = [weakref.ref(array) if isinstance(array, jax.Array) else None for array in walk.numbers]
-        # Of NumPy's arrays copies, as the caller's may change.
+        # Copies of NumPy's arrays, as the caller may change them.
         return code, tuple(array if isinstance(array, jax.Array) else jnp.array(array) for array in walk.numbers)
 
     def __eq__(self, other: object) -> bool:
@@ -58,17 +58,17 @@ class Code:
         return _code_of, (self.function,)
 
     def with_numbers(self, numbers: Sequence[Any]) -> Callable[..., Any]:
-        """The function, with these numbers in place of its own."""
+        """Return the function with these numbers in place of its own."""
         return self._made(iter(numbers)) if self._arrays else self.function
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """Names of what the function closes over, reads as globals, and of their attributes."""
+        """Names of variables that the function closes over and of globals and attributes that it reads."""
         code = getattr(self.function, "__code__", None)
         return () if code is None else (*code.co_freevars, *code.co_names)
 
     def has_changed(self) -> bool:
-        """Whether what the function reads is no longer what it was, as far as that can be told."""
+        """Tell whether what the function reads has changed, as far as that can be found out."""
         if isinstance(self._key, Same):
             return False
         now, numbers = Code.of(self.function)

@@ -1,4 +1,4 @@
-"""Walk through a function and all that it reads, for what compares it and how it is made again."""
+"""Walk through a function and all that it reads, to compare it and to make it again with other numbers."""
 
 import abc
 import builtins
@@ -18,15 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Maker = Callable[[Iterator[Any]], Any]  # makes a value again, of the numbers in it
+Maker = Callable[[Iterator[Any]], Any]  # makes a value again from an iterator of its numbers
 
 
 class Undecided(Exception):
-    """Whether two such values are the same cannot be told."""
+    """Raised where values cannot be compared."""
 
 
 class Same:
-    """A value that equals itself alone."""
+    """A value that equals only itself."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -39,10 +39,10 @@ class Same:
 
 
 _ATOMS = (type(None), bool, int, float, complex, str, bytes, type(...), range)
-# By identity, as for JAX itself.
+# Compared by identity, as JAX does.
 _OPAQUE = (np.ufunc, type(np.dot), jnp.ufunc, type(jax.jit(abs)), jax.custom_jvp, jax.custom_vjp, Enum)
 _BASES = (object, abc.ABC, typing.Generic, typing.Protocol, types.SimpleNamespace)
-# What reads by names that stand in no code.
+# Functions that read by names which are in no code.
 _DYNAMIC = {"getattr", "vars", "globals", "locals", "eval", "exec", "__import__", "import_module", "__dict__"}
 _DYNAMIC |= {"attrgetter", "methodcaller", "asdict", "astuple", "fields", "copy", "deepcopy", "__getattribute__"}
 _UNCALLED = {"__init__", "__new__", "__post_init__", "__init_subclass__", "__setattr__", "__repr__", "__str__"}
@@ -56,7 +56,7 @@ _LIBRARIES = tuple(
 
 
 def _is_library(value: Any) -> bool:
-    """Whether a module, class or function is one that no user changes: of Python, an installed package, or linkax."""
+    """Tell whether a module, class or function is of Python, an installed package or linkax, which no user changes."""
     if isinstance(value, types.FunctionType):
         path = value.__code__.co_filename
     else:
@@ -72,7 +72,7 @@ def _is_pytree(value: Any) -> bool:
 
 
 def _all_code(code: types.CodeType) -> Iterator[types.CodeType]:
-    """Code, and that of functions in it."""
+    """Go through code and the code of functions in it."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
@@ -81,7 +81,7 @@ def _all_code(code: types.CodeType) -> Iterator[types.CodeType]:
 
 @functools.lru_cache(maxsize=1024)
 def _names(code: types.CodeType) -> tuple[set[str], set[str]]:
-    """Names of globals and attributes in code, and of modules that it imports when it runs."""
+    """Find the names of globals and attributes in code, and of modules that it imports when it runs."""
     names, imported = set(), set()
     for part in _all_code(code):
         names.update(part.co_names)
@@ -97,11 +97,12 @@ def _names(code: types.CodeType) -> tuple[set[str], set[str]]:
 
 
 class Walk:
-    """Through a function and all that it reads.
+    """A walk through a function and all that it reads.
 
-    Each part gives a key, which compares it, and how it is made again, of an iterator of numbers.
+    Each part gives a key, which compares it, and a `Maker`.
 
-    - `names`: those in all code met so far. `numbers`: those met so far.
+    - `names`: names in all code met so far.
+    - `numbers`: numbers met so far.
     """
 
     def __init__(self, names: Iterable[str]):
@@ -109,9 +110,9 @@ class Walk:
         self._attributes, self._around, self._count, self._is_traced = frozenset(names), [], 0, True
 
     def part(self, value: Any, is_explicit: bool = False) -> tuple[Any, Maker]:
-        """Key and maker of a value.
+        """Find the key and the maker of a value.
 
-        Where `is_explicit`, its floats and NumPy's arrays are numbers too, and what cannot be decided in it is
+        Where `is_explicit`, its floats and NumPy arrays are numbers too, and parts of it that cannot be compared are
         compared by identity, as JAX does.
         """
         self._count += 1
@@ -142,7 +143,7 @@ class Walk:
             self._around.pop()
 
     def key(self, value: Any) -> Any:
-        """Key of what is read, and not made again: its arrays are no numbers."""
+        """Find the key of a value that is read and not made again, so that its arrays are no numbers."""
         traced, self._is_traced = self._is_traced, False
         key, _ = self.part(value)
         self._is_traced = traced
@@ -239,7 +240,7 @@ class Walk:
         return (Same(kind), self._read(kind), self._read(value)), lambda _: value
 
     def _read(self, space: Any) -> Any:
-        """Key of the attributes of a module, class or instance that code names, or calls without a name."""
+        """Find the key of attributes of a module, class or instance that code names, or calls as operators."""
         spaces = [base for base in space.__mro__ if not _is_library(base)] if isinstance(space, type) else [space]
         found = {}
         for entries in map(vars, reversed(spaces)):

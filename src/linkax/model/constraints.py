@@ -36,7 +36,7 @@ class AbstractConstraint(AbstractElement):
         """Compute the right side at time t [s]."""
 
     def held(self, t: Number, unless: Any = False) -> "AbstractConstraint":
-        """Return the constraint with its right side kept from time t on, except where `unless`, which may be traced."""
+        """Keep the right side of time t at all times, except where `unless`, which may be traced."""
         return self
 
 

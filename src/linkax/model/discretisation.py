@@ -19,7 +19,7 @@ from linkax.xla.arrays import Scalar
 
 
 class Parts(NamedTuple):
-    """What a mechanism is made of, with beams taken apart."""
+    """The parts of a mechanism, with beams taken apart."""
 
     bodies: list[RigidBody]
     joints: list[AbstractJoint]
@@ -46,7 +46,7 @@ def discretise_beams(
     stations, holds = [], []
 
     def on_station(part: Any) -> Any:
-        """The part itself, or a place on a beam as a frame on a massless body that is held there."""
+        """Replace a place on a beam by a frame on a massless body that is held there; keep other parts."""
         if not (isinstance(part, Place) and part.body in beams):
             return part
         name = f"{part.body}({sum(body.name.startswith(part.body + '(') for body in stations) + 1})"
@@ -67,14 +67,14 @@ def discretise_beams(
 
 
 def tree_joints_first(joints: Iterable[AbstractJoint]) -> list[set[str]]:
-    """Names of the joints that must be in the tree: those along beams, then those that slide on them too."""
+    """Name the joints that must be in the tree: those of beams, then also those that slide on beams."""
     joints = list(joints)
     segments = {joint.name for joint in joints if isinstance(joint, BeamSegment)}
     return [segments, {joint.name for joint in joints if isinstance(joint, OnBeam)}]
 
 
 def _sections(beam: Beam) -> list[RigidBody]:
-    """The sections of a beam: massless at nodes, with half of an element's mass at each place between them."""
+    """Make the sections of a beam: massless at nodes, with half of an element's mass at each place between them."""
     density, (about_y, about_z) = beam.section.linear_density, beam.section.rotary_inertia
     inertia, share = jnp.stack([about_y + about_z, about_y, about_z]), beam.element_length / len(MASS_PLACES)
     at_nodes = {name: RigidBody(name, 0.0) for name in beam.nodes}
@@ -83,7 +83,7 @@ def _sections(beam: Beam) -> list[RigidBody]:
 
 
 def _segments(beam: Beam) -> list[BeamSegment]:
-    """The joints from the first node of each element to its second one, and to the sections between them."""
+    """Make the joints from the first node of each element to its second node and to the sections between them."""
     joints = []
     for element, far in enumerate(beam.nodes[1:]):
         joints.append(_segment(beam, beam.name if element == 0 else far, far, element, 1.0))
@@ -94,7 +94,7 @@ def _segments(beam: Beam) -> list[BeamSegment]:
 
 
 def _hold(beam: Beam, name: str, place: Place) -> BeamSegment:
-    """The joint that holds a massless body at a place on the axis."""
+    """Make the joint that holds a massless body at a place on the axis."""
     within = place.offset[0] / beam.element_length - place.element
     return _segment(beam, name, name, place.element, within)
 
@@ -104,7 +104,7 @@ def _segment(beam: Beam, name: str, child: str, element: int, place: Scalar | fl
 
 
 def _split_sleeve(sleeve: AbstractJoint, beams: dict[str, Beam]) -> tuple[list[RigidBody], list[AbstractJoint]]:
-    """The parts of a sleeve, one in each element, after the massless bodies between them; other joints as they are."""
+    """Split a sleeve into parts, one in each element, and massless bodies between them; keep other joints."""
     if not (isinstance(sleeve, Sliding) and sleeve.beam in beams):
         return [], [sleeve]
     beam = beams[sleeve.beam]

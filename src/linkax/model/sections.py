@@ -1,4 +1,4 @@
-"""Cross-sections of beams: from stiffnesses, or from a profile and a material."""
+"""Cross-sections of beams, from stiffnesses or from a profile and a material."""
 
 import math
 from typing import Any
@@ -18,7 +18,7 @@ GIVE_MATERIAL = "give a lx.Material(youngs_modulus, poissons_ratio, density)"
 class Material(eqx.Module):
     """An isotropic elastic material.
 
-    - `youngs_modulus` E [Pa], `poissons_ratio` ν, `density` ρ [kg/m³].
+    **Arguments:** `youngs_modulus`: E [Pa]; `poissons_ratio`: ν; `density`: ρ [kg/m³].
 
     **Raises:** `ValueError` for a modulus or a density that is not positive, and for ν outside (−1, 0.5].
     """
@@ -45,15 +45,15 @@ class Section(eqx.Module):
 
     **Arguments:**
 
-    - `bending_stiffness`: E I_y and E I_z [N m²], against bending about y (deflection along z) and about z
-      (deflection along y); one number for both.
+    - `bending_stiffness`: E I_y and E I_z [N m²], for bending about y (deflection along z) and about z (deflection
+      along y), or one number for both.
     - `linear_density`: ρ A [kg/m].
-    - `axial_stiffness`: E A [N]; needed by beams that stretch.
-    - `torsional_stiffness`: G J [N m²]; needed by beams that twist.
-    - `shear_stiffness`: k G A along y and z [N], k the shear coefficient; one number for both; needed by
-      beams that shear.
-    - `rotary_inertia`: ρ I_y and ρ I_z [kg m]; one number for both. Default: of a uniform material,
-      ρ A × E I / E A, and none where `axial_stiffness` is not given.
+    - `axial_stiffness`: E A [N], which beams need that stretch.
+    - `torsional_stiffness`: G J [N m²], which beams need that twist.
+    - `shear_stiffness`: k G A along y and z [N], with the shear coefficient k, or one number for both, which beams
+      need that shear.
+    - `rotary_inertia`: ρ I_y and ρ I_z [kg m], or one number for both. Default: ρ A × E I / E A, as for a uniform
+      material, and zero without `axial_stiffness`.
 
     **Raises:** `ValueError` for a stiffness or a density that is not positive, and for a negative inertia.
     """
@@ -90,7 +90,7 @@ class Section(eqx.Module):
             self.rotary_inertia = np.zeros(2)
 
     def stiffness(self, strain: int) -> Scalar | None:
-        """The stiffness against one component of strain: twist, bending about y and z, stretch, shear along y and z."""
+        """Return the stiffness of strain 0 to 5, or None: twist, bending about y, z, stretch, shear along y, z."""
         of_strain = [
             self.torsional_stiffness,
             self.bending_stiffness[0],
@@ -103,7 +103,7 @@ class Section(eqx.Module):
 
 
 def _pair(entry: Any, what: str) -> Float[Array, "2"]:
-    """Two numbers, or one for both."""
+    """Read two numbers, or one for both."""
     array = real(entry, what)
     return number(array * np.ones(2) if array.shape == () else array, (2,), what)
 
@@ -119,7 +119,7 @@ def _of_profile(
     torsion_constant: Scalar,
     shear_coefficients: tuple[Scalar, Scalar],
 ) -> Section:
-    """A section of one material; `second_moments` of area about y and z [m⁴]."""
+    """Make a section of one material; `second_moments`: of area, about y and z [m⁴]."""
     young, shear, density = material.youngs_modulus, material.shear_modulus, material.density
     moments = jnp.stack(jnp.broadcast_arrays(*second_moments))
     return Section(
@@ -133,7 +133,7 @@ def _of_profile(
 
 
 def _wall(thickness: Number, sizes: tuple[Scalar, ...], what: str) -> Scalar:
-    """The thickness of walls that fit into a profile of these sizes."""
+    """Check that walls of a thickness fit into a profile of these sizes."""
     most = namespace(*sizes).stack(sizes).min() / 2.0
     known_most = "" if concrete(most) is None else f", {float(most)}"
     remedy = f"it must be positive, and less than half of the profile{known_most}"
@@ -141,11 +141,13 @@ def _wall(thickness: Number, sizes: tuple[Scalar, ...], what: str) -> Scalar:
 
 
 def rectangle(width: Number, height: Number, material: Material, thickness: Number | None = None) -> Section:
-    """A rectangular profile, solid or hollow: `width` along y, `height` along z, wall `thickness` [m].
+    """Make the section of a rectangular profile, solid or hollow.
 
-    Torsion constant: Bredt's formula for thin walls (Young and Budynas, Roark's Formulas for Stress
-    and Strain, 7th ed., table 10.1), a series there for solid ones. Shear coefficients: Cowper,
-    Journal of Applied Mechanics 33 (1966), for thin-walled boxes and for solid rectangles.
+    Its torsion constant is that of Young and Budynas, Roark's Formulas for Stress and Strain (7th ed., table 10.1):
+    Bredt's formula for thin walls, a series for solid profiles. Its shear coefficients are those of Cowper, Journal
+    of Applied Mechanics 33 (1966), for thin-walled boxes and for solid rectangles.
+
+    **Arguments:** `width` along y and `height` along z [m]; `material`; `thickness` of the walls [m] (default: solid).
 
     **Raises:** `ValueError` for a size that is not positive, and for walls that do not fit.
     """
@@ -173,7 +175,7 @@ def rectangle(width: Number, height: Number, material: Material, thickness: Numb
 
 
 def _box_shear(width: Scalar, height: Scalar, ratio: Scalar) -> Scalar:
-    """Cowper's shear coefficient of a thin-walled box for a force along its height."""
+    """Compute Cowper's shear coefficient of a thin-walled box, for a force along its height."""
     n = width / height
     m = n  # × the thickness of the flanges over that of the webs
     flanges = 12.0 + 72.0 * m + 150.0 * m**2 + 90.0 * m**3 + ratio * (11.0 + 66.0 * m + 135.0 * m**2 + 90.0 * m**3)
@@ -182,9 +184,11 @@ def _box_shear(width: Scalar, height: Scalar, ratio: Scalar) -> Scalar:
 
 
 def circle(diameter: Number, material: Material, thickness: Number | None = None) -> Section:
-    """A circular profile, solid or a tube: outer `diameter`, wall `thickness` [m].
+    """Make the section of a circular profile, solid or a tube.
 
-    Shear coefficient: Cowper, Journal of Applied Mechanics 33 (1966).
+    Its shear coefficient is that of Cowper, Journal of Applied Mechanics 33 (1966).
+
+    **Arguments:** outer `diameter` [m]; `material`; `thickness` of the wall [m] (default: solid).
 
     **Raises:** `ValueError` for a size that is not positive, and for walls that do not fit.
     """

@@ -242,7 +242,7 @@ class Topology:
 
     @cached_property
     def loop(self) -> np.ndarray:
-        """+1 for tree joints from a loop's common ancestor to the cut joint's child, -1 to its parent, (n_cuts, n_b)."""
+        """+1 for tree joints from a loop's common ancestor to the cut joint's child, -1 to its parent; (cuts, n_b)."""
         cuts = slice(self.num_bodies, None)
         return self.path[list(self.child[cuts])] - self.path[list(self.parent[cuts])]
 

@@ -24,9 +24,9 @@ SCENES: dict[str, Scene] = {scene.name: scene for scene in _ALL}
 
 
 def scene(name: str) -> Scene:
-    """The scene of that name.
+    """Return the scene of that name.
 
-    **Raises:** `ValueError` naming the known ones.
+    **Raises:** `ValueError` for an unknown name, with the known ones.
     """
     if name not in SCENES:
         raise ValueError(f"unknown scene {name!r}; known: {', '.join(SCENES)}")

@@ -1,18 +1,18 @@
 """Bricard's mechanism, problem A04 of the LIM/IFToMM benchmark library.
 
-Five rods and six hinges: counted, it cannot move; it does, as one of its loop rows always depends on the others.
+Five rods and six hinges have no mobility by count. It moves, as one of its loop rows always depends on the others.
 """
 
 import linkax as lx
 from linkax.scenes.scene import Parameters, Scene, Variant
 
-# Where the hinges are at the start, in lengths of a rod, and about which axis each turns.
+# Positions of the hinges at the start, in lengths of a rod, and the axis of each.
 PLACES = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.0, -1.0, 1.0), (0.0, -1.0, 1.0), (0.0, 0.0, 1.0))
 AXES = "yzxyzx"
 
 
 def _rod(index: int, parameters: Parameters) -> lx.RigidBody:
-    """A square bar from one hinge to the next, in world axes at the start."""
+    """Make a square bar from one hinge to the next, in world axes at the start."""
     along = [end - begin for begin, end in zip(PLACES[index], PLACES[index + 1], strict=True)]
     length, width, mass = parameters["length"], parameters["width"], parameters["mass"]
     own, across = mass * width**2 / 6.0, mass * (length**2 + width**2) / 12.0

@@ -1,4 +1,4 @@
-"""Motion in closed form that several scenes share: that of a pendulum, swinging or turning."""
+"""The motion of a pendulum, swinging or turning, in closed form, which several scenes share."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,17 +6,18 @@ from scipy.special import ellipj, ellipkinc
 
 from linkax.model.numbers import Number, Vector
 
-SLOW = 1e-8  # of k² from one: so close to coming to rest upright, elliptic functions lose their digits
+SLOW = 1e-8  # |k² − 1|, below which elliptic functions lose their digits, next to coming to rest upright
 
 
 def turned_link(times: Vector, stiffness: Number, angle: Number, speed: Number) -> Float[np.ndarray, "times 3"] | None:
-    """Unit vectors (n, 3) along a link that moves like a pendulum: α̈ = −ω² cos α, α from +x towards +y.
+    """Compute unit vectors (n, 3) along a link that moves like a pendulum: α̈ = −ω² cos α, α from +x towards +y.
 
-    None where it comes too close to rest upright.
+    None where the link nearly comes to rest upright.
 
     **Arguments:**
 
-    - `times` [s], from the start; `stiffness`: ω² [1/s²].
+    - `times`: [s], from the start.
+    - `stiffness`: ω² [1/s²].
     - `angle`, `speed`: α and α̇ at the start [rad, rad/s].
     """
     hanging = -np.pi / 2 if stiffness >= 0.0 else np.pi / 2
@@ -30,9 +31,9 @@ def turned_link(times: Vector, stiffness: Number, angle: Number, speed: Number) 
 def pendulum_angle(
     times: Vector, stiffness: Number, angle: Number, speed: Number
 ) -> Float[np.ndarray, " times"] | None:
-    """θ(t) of θ̈ = −ω² sin θ, by Jacobi's elliptic functions [rad]; None where it comes too close to rest upright.
+    """Solve θ̈ = −ω² sin θ for θ(t) [rad] by Jacobi's elliptic functions; None where it nearly comes to rest upright.
 
-    Whittaker, Analytical Dynamics of Particles and Rigid Bodies (4th ed.), section 44.
+    Whittaker, Analytical Dynamics of Particles and Rigid Bodies (4th ed.), section 44. Arguments: see `turned_link`.
     """
     times = np.asarray(times, dtype=float)
     if stiffness == 0.0:

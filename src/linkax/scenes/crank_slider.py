@@ -1,4 +1,4 @@
-"""Planar crank-slider with equal lengths, example a of the paper, which meets singular positions.
+"""Planar crank-slider with equal lengths, which passes singular positions: example a of the paper.
 
 Zhao, Qi, Wang, Xu, Applied Mathematics and Mechanics 47(8), 2026, doi 10.21656/1000-0887.450230.
 """
@@ -42,10 +42,10 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
 
 
 def _rod(crank: Number, rod: Number, angle: Number, speed: Number) -> tuple[Scalar, Scalar, Scalar]:
-    """Angle of the rod from +x [rad], its rate [rad/s], and the slider's distance [m].
+    """Compute the rod's angle from +x [rad], its rate [rad/s], and the slider's distance [m].
 
-    Where the crank is not shorter than the rod, the rod points to +x while the crank does: with
-    equal lengths the slider then moves through the crank's axis, and does not rest there.
+    Where the crank is not shorter than the rod, the rod points to +x while the crank does. With equal lengths the
+    slider then moves through the crank's axis instead of resting there.
     """
     along_crank, across_crank = crank * jnp.cos(angle), crank * jnp.sin(angle)
     # rod² - across_crank², written so that equal lengths give along_crank² to rounding.

@@ -1,6 +1,6 @@
 """Row of N parallelogram four-bars, problem A02 of the LIM/IFToMM benchmark library.
 
-When all links lie in line the mechanism has N + 1 degrees of freedom for a moment.
+Where all links are in line it has N + 1 degrees of freedom for a moment.
 """
 
 import math
@@ -30,7 +30,7 @@ def _mechanism(parameters: Parameters) -> lx.Mechanism:
 
 
 def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
-    """All joints are given, because a start with the links in line has other branches too."""
+    """Give all joints, as a start with the links in line has other branches too."""
     return lx.assemble(
         mechanism,
         positions=_parallel(parameters["N"], parameters["angle"]),
@@ -39,7 +39,7 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
 
 
 def _parallel(count: int, turn: Number) -> dict[str, Number]:
-    """All joints where vertical links turn alike and couplers only translate."""
+    """Give all joints their coordinates, or speeds, where links turn alike and couplers only translate."""
     return (
         {f"pivot_{i}": turn for i in range(count + 1)}
         | {f"left_{i}": -turn for i in range(1, count + 1)}

@@ -1,4 +1,4 @@
-"""Planar four-bar of massless links and two particles, of the textbook Learn Multibody Dynamics.
+"""Planar four-bar of massless links with two particles, from a textbook.
 
 J. Moore, Learn Multibody Dynamics, chapter on holonomic constraints. One link has no mass at all.
 """
@@ -12,7 +12,7 @@ from linkax.scenes.scene import Parameters, Scene, Variant
 
 def _mechanism(parameters: Parameters) -> lx.Mechanism:
     def massless(name: str, length: Number, particle: Number) -> lx.RigidBody:
-        """A massless link with a particle at its tip."""
+        """Make a massless link with a particle at its tip."""
         tip = [length, 0.0, 0.0]
         return lx.RigidBody(name, particle, center_of_mass=tip, frames={"base": [0.0, 0.0, 0.0], "tip": tip})
 

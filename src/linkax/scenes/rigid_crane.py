@@ -1,7 +1,6 @@
-"""Luffing telescopic crane of rigid sections: a stand-in for example c of the paper, with numbers of our own.
+"""Luffing telescopic crane of rigid sections, in place of example c of the paper, with numbers of our own.
 
-Three sections slide in each other, a rope makes the third one follow the second, and a cylinder
-under the boom luffs it.
+Three sections slide in each other. A rope makes the third one follow the second, and a cylinder luffs the boom.
 """
 
 import math
@@ -14,7 +13,7 @@ from linkax.scenes.scene import Parameters, Scene, Variant
 from linkax.xla.arrays import Scalar
 
 SECTION = 10.0  # length of each section [m]
-OVERLAP = 1.0  # how far each section's rear end is ahead of the last one's, retracted [m]
+OVERLAP = 1.0  # from the rear end of a section to that of the next, retracted [m]
 FOOT = (2.0, -1.0)  # of the luffing cylinder, from the boom's pivot [m]
 HEAD = 4.0  # of the luffing cylinder, along the boom [m]
 
@@ -24,7 +23,7 @@ def _section(index: int, mass: Number) -> lx.RigidBody:
 
 
 def _cylinder(name: str, mass: Number, center: float, inertia: float) -> lx.RigidBody:
-    """A part of the luffing cylinder, along x; mass [kg], centre of mass halfway [m], inertia [kg m²]."""
+    """Make a part of the luffing cylinder along x: `mass` [kg], `center` of mass halfway [m], `inertia` [kg m²]."""
     frames = {"end": [2.0 * center, 0.0, 0.0]}
     return lx.RigidBody(name, mass, [center, 0.0, 0.0], [0.0, inertia, inertia], frames)
 
@@ -59,7 +58,7 @@ def _mechanism(parameters: Parameters) -> lx.Mechanism:
 
 
 def _reach(angle: Number) -> Scalar:
-    """Length of the luffing cylinder at an angle of the boom [m]."""
+    """Compute the length of the luffing cylinder [m] at an angle of the boom [rad]."""
     return jnp.hypot(HEAD * jnp.cos(angle) - FOOT[0], HEAD * jnp.sin(angle) - FOOT[1])
 
 

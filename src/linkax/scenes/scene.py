@@ -1,4 +1,4 @@
-"""What a ready-made scene is: a mechanism as a function of named parameters, and where it starts."""
+"""Scenes: mechanisms as functions of named parameters, with their initial states."""
 
 import dataclasses
 import math
@@ -19,8 +19,8 @@ Parameters = Mapping[str, Any]  # numbers, some of them traced
 class Variant:
     """A named choice of a scene's parameters.
 
-    - `summary`: what it is, one line.
-    - `parameters`: those that differ from the scene's defaults.
+    - `summary`: a description in one line.
+    - `parameters`: those with other values than the scene's defaults.
     - `t1`: end time [s], where it differs from the scene's.
     """
 
@@ -31,18 +31,18 @@ class Variant:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A mechanism with named parameters, its start, and the points to look at.
+    """A mechanism with named parameters, its initial state, and points of interest.
 
-    - `parameters`: default of each parameter, SI units; initial conditions are among them. A
-      default that is an integer marks a count, which is structure: an integer, one or more.
-    - `meanings`: what each parameter is, with its unit.
+    - `parameters`: the default of each parameter, in SI units; initial conditions are among them. A parameter with
+      an integer default is a count, which is structure: an integer of at least one.
+    - `meanings`: the meaning of each parameter, with its unit.
     - `variants`, `default_variant`: named choices of parameters.
     - `t1`: end time [s].
-    - `mechanism`: parameters -> `Mechanism`, a pure function; all but counts may be traced.
-    - `initial`: (mechanism, parameters) -> `State`.
-    - `points`: parameters -> {name: (body, frame of the body or None for its centre of mass)}.
-    - `exact`: (parameters, times [s]) -> {name of a point: positions (n_t, 3) [m]}, in closed form, or None where
-      there is none for these parameters; or None.
+    - `mechanism`: parameters ↦ `Mechanism`, a pure function; all but counts may be traced.
+    - `initial`: (mechanism, parameters) ↦ `State`.
+    - `points`: parameters ↦ {name: (body, frame of the body or None for its centre of mass)}.
+    - `exact`: (parameters, times [s]) ↦ {name of a point: positions (n_t, 3) [m]} in closed form, or None for
+      parameters without one; None for a scene without one.
 
     ```python
     parameters = scene.settings("SC2", {"speed": 3.0})
@@ -64,9 +64,9 @@ class Scene:
     exact: Callable[[Parameters, np.ndarray], dict[str, np.ndarray] | None] | None = None
 
     def variant(self, name: str | None = None) -> Variant:
-        """The variant of that name, or the default one.
+        """Return the variant of that name, by default the default one.
 
-        **Raises:** `ValueError` naming the known ones.
+        **Raises:** `ValueError` for an unknown name, with the known ones.
         """
         name = self.default_variant if name is None else name
         if name not in self.variants:
@@ -74,18 +74,18 @@ class Scene:
         return self.variants[name]
 
     def settings(self, variant: str | None = None, changes: Parameters | None = None) -> dict[str, Any]:
-        """All parameters: defaults, those of a variant over them, and `changes` over both.
+        """Return all parameters: defaults, replaced by those of a variant, replaced by `changes`.
 
-        `changes` may hold numbers, traced numbers, or text to be read as numbers.
+        `changes` holds numbers, traced or not, or text that is read as a number.
 
-        **Raises:** `ValueError` for an unknown name, and for a value that is not a finite number,
-        or not an integer of at least one where a count is expected.
+        **Raises:** `ValueError` for an unknown name, for a value that is not a finite number, and for a count that
+        is not an integer of at least one.
         """
         checked = {name: self._checked(name, entry) for name, entry in (changes or {}).items()}
         return {**self.parameters, **self.variant(variant).parameters, **checked}
 
     def duration(self, variant: str | None = None) -> float:
-        """End time of a variant [s]."""
+        """Return the end time of a variant [s]."""
         t1 = self.variant(variant).t1
         return self.t1 if t1 is None else t1
 

@@ -1,8 +1,8 @@
-"""Rhombus of spatial bodies and hinges, example b of the paper as far as it can be inferred.
+"""Rhombus of spatial bodies and hinges: example b of the paper, as far as it can be inferred.
 
-Zhao, Qi, Wang, Xu, Applied Mathematics and Mechanics 47(8), 2026, doi 10.21656/1000-0887.450230. The
-paper prints neither lengths nor masses; these are ours. Three constraints are always redundant, and
-a fourth one where all links lie in line.
+Zhao, Qi, Wang, Xu, Applied Mathematics and Mechanics 47(8), 2026, doi 10.21656/1000-0887.450230. The paper gives
+neither lengths nor masses; these are ours. Three constraints are always redundant, a fourth where all links are in
+line.
 """
 
 import math
@@ -30,7 +30,7 @@ def _mechanism(parameters: Parameters) -> lx.Mechanism:
 
 
 def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
-    """All joints are given, because a start with the links in line has other branches too."""
+    """Give all joints, as a start with the links in line has other branches too."""
     turning = lambda turn: {"A": turn, "B": -turn, "C": turn, "D": turn}
     return lx.assemble(mechanism, turning(parameters["angle"]), turning(parameters["speed"]))
 

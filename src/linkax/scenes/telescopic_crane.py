@@ -1,11 +1,11 @@
 """Telescopic crane with a flexible boom: example c of the paper (Figs. 16 to 20), with numbers of our own.
 
-A turntable carries a boom of three box sections that bend. Each slides in the one before, on a pad at
-its own rear end and on another at the front end of the other. One cylinder luffs the boom, another
-pushes the second section out, and a rope from the first section, over a sheave at the front of the
-second, pulls the third one out as far. The load hangs on a rope from the tip.
+A turntable carries a boom of three box sections that bend. Each section slides in the one before, on a pad at its
+rear end and on a pad at the front end of that one. One cylinder luffs the boom, another pushes the second section
+out, and a rope from the first section over a sheave at the front of the second pulls the third one out as far. The
+load hangs on a rope from the tip.
 
-Sizes are about those of a mobile crane for 30 tonnes; they are from no data sheet.
+Sizes are about those of a mobile crane for 30 tonnes, from no data sheet.
 """
 
 import math
@@ -29,7 +29,7 @@ STEEL = {"poissons_ratio": 0.3, "density": 7850.0}
 
 
 class Course(eqx.Module):
-    """From one value to another in a time [s], smoothly (a polynomial of fifth degree)."""
+    """A smooth change from one value to another in a time [s], by a polynomial of fifth degree."""
 
     begin: Scalar
     end: Scalar
@@ -41,7 +41,7 @@ class Course(eqx.Module):
 
 
 class Reach(eqx.Module):
-    """Length of the luffing cylinder [m], where the angle of the boom, unbent, takes a course."""
+    """The length of the luffing cylinder [m] where the angle of the unbent boom takes a course [rad]."""
 
     angle: Course
 
@@ -50,7 +50,7 @@ class Reach(eqx.Module):
 
 
 def reach(angle: Number) -> Scalar:
-    """Length of the luffing cylinder at an angle of the boom, unbent [m]."""
+    """Compute the length of the luffing cylinder [m] at an angle of the unbent boom [rad]."""
     return jnp.hypot(HEAD * jnp.cos(angle) - FOOT[0], HEAD * jnp.sin(angle) - FOOT[1])
 
 
@@ -83,7 +83,7 @@ def _boom(parameters: Parameters) -> list[lx.Beam]:
 def _telescope(
     outer: lx.Beam, inner: lx.Beam, index: int, pad: Callable[..., lx.AbstractJoint]
 ) -> tuple[list[lx.RigidBody], list[lx.AbstractJoint]]:
-    """The pads between two sections: massless shoes that slide on one, and joints from these to the other."""
+    """Make the pads between two sections: massless shoes that slide on one, and joints from these to the other."""
     rear, front = (lx.point_mass(f"{end}_shoe_{index}", 0.0) for end in ("rear", "front"))
     return [rear, front], [
         lx.Sliding(f"extension_{index}", outer, rear),
@@ -134,7 +134,7 @@ def _mechanism(parameters: Parameters) -> lx.Mechanism:
 
 
 def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
-    """At rest, bent by the load that hangs on it before."""
+    """Start at rest, bent by the load that hangs there before."""
     before = _mechanism({**parameters, "payload": parameters["payload"] + parameters["dropped"]})
     extension, angle = parameters["extension"], parameters["angle"]
     guess = {"slew": parameters["slew"], "pivot": angle, "hook": -angle}

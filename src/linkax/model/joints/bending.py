@@ -1,10 +1,9 @@
-"""Joints to sections of a beam: their motion is that of the beam's axis, by its strains.
+"""Joints to sections of a beam, whose motion follows the strains of its axis.
 
-Along a beam the section's axes R and its place p follow the strains of the axis, twist and curvatures κ
-and stretch and shears γ: R' = R κ̂, p' = R (e₁ + γ) (Reissner, 1973; Simo, 1985). Strains are linear
-between nodes; from an element's first node to a section of it the solution is the exponential of a
-screw (Magnus series to sixth order: Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009; exact
-where strains are constant).
+Along a beam the axes R and the position p of its sections follow R' = R κ̂ and p' = R (e₁ + γ), where κ are twist and
+curvatures, γ stretch and shears (Reissner, 1973; Simo, 1985). Strains are linear between nodes. From the first node
+of an element to a section of it the solution is the exponential of a screw, by a Magnus series of sixth order (Blanes,
+Casas, Oteo and Ros, Physics Reports 470, 2009), which is exact where strains are constant.
 """
 
 import dataclasses
@@ -26,16 +25,17 @@ from linkax.xla.arrays import Array, Scalar
 
 
 def strain_unit(strain: int) -> str:
-    """Unit of a coordinate of a strain: of an element's turn, or of its elongation."""
+    """Return the unit of the coordinate of a strain: rad for twist and bending, m for stretch and shear."""
     return "rad" if strain < 3 else "m"
 
 
 def _along_element(
     first: Float[Array, "6"], second: Float[Array, "6"], length: Scalar, end: Scalar
 ) -> Float[jax.Array, "4 4"]:
-    """The motion from an element's first node to a section.
+    """Compute the motion from the first node of an element to a section of it.
 
-    `first`, `second`: strains at its nodes times its `length`, (6,) each; `end`: where the section is, from 0 to 1.
+    **Arguments:** `first`, `second`: strains at its nodes × its `length`, (6,) each; `end`: where the section is, from
+    0 to 1.
     """
     slope, straight = second - first, length * np.eye(NUM_STRAINS)[3]
     begin, slope = screw_matrix(first + straight), screw_matrix(slope)
@@ -45,12 +45,12 @@ def _along_element(
 
 
 def _bracket(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[jax.Array, "4 4"]:
-    """Of screws along which motions follow each other from the left to the right."""
+    """Compute the Lie bracket of screws, for motions that follow each other from left to right."""
     return compose(second, first) - compose(first, second)
 
 
 def _all_strains(coordinates: Float[Array, " n"], strains: tuple[int, ...]) -> Float[jax.Array, "nodes 6"]:
-    """All components of strain at nodes, times the element's length, (n, 6), where coordinates are some of them."""
+    """Compute all six strains at nodes, × the element's length, (nodes, 6), from coordinates that are some of them."""
     given = coordinates.reshape(-1, len(strains))
     return jnp.zeros((len(given), NUM_STRAINS), coordinates.dtype).at[:, np.array(strains)].set(given)
 
@@ -58,9 +58,10 @@ def _all_strains(coordinates: Float[Array, " n"], strains: tuple[int, ...]) -> F
 def section_at(
     coordinates: Float[Array, " n"], strains: tuple[int, ...], length: Scalar, place: Scalar
 ) -> tuple[Float[jax.Array, "4 4"], Int[jax.Array, ""]]:
-    """A section at a place [m], seen from the first node of its element, and which element that is.
+    """Compute the motion from the first node of an element to the section at a place [m], and find that element.
 
-    `coordinates`: of the whole beam; `strains`: which ones they are; `length`: of an element.
+    **Arguments:** `coordinates`: those of the whole beam; `strains`: which strains they are; `length`: that of an
+    element [m]; `place` [m]: from the base.
     """
     of_nodes = _all_strains(coordinates, strains)
     element = jnp.clip(jnp.floor(place / length), 0, len(of_nodes) - 2).astype(int)
@@ -69,12 +70,12 @@ def section_at(
 
 @dataclasses.dataclass(frozen=True)
 class WithinElement(RelativeMotion):
-    """From an element's first node to a section of it, at a distance that a last coordinate may add to.
+    """The motion from the first node of an element to a section of it; a last coordinate [m] may move the section.
 
-    Parameters: the element's length, where the section is from 0 to 1 without that coordinate, and whether the way
-    may go on before the element, and behind it; else it ends there.
+    Parameters: the element's length [m]; where the section is, from 0 to 1, without that coordinate; whether the way
+    goes on before the element, and behind it (1 or 0). Where it does not, the section stays at that end.
 
-    - `strains`: which components are coordinates; the others are zero.
+    - `strains`: which strains are coordinates; the others are zero.
     """
 
     strains: tuple[int, ...]
@@ -90,10 +91,13 @@ class WithinElement(RelativeMotion):
 
 
 class OnBeam(AbstractJoint):
-    """A joint in the tree that moves as an element of a beam bends; it is never cut.
+    """A joint in the tree that moves as an element of a beam deforms. It is never cut.
 
-    - `beam`: the name of the joint that has the beam's strains as coordinates.
-    - `strains`: see `linkax.Beam`; `elements`: their number; `length`: of an element [m]; `element`: which one.
+    - `beam`: the name of the beam, and of the joint that has its strains as coordinates.
+    - `strains`: which strains the beam has, see `linkax.Beam`.
+    - `elements`: the number of its elements.
+    - `length`: that of an element [m].
+    - `element`: the element, from 0.
     """
 
     locked_rotations = ()
@@ -122,12 +126,12 @@ class OnBeam(AbstractJoint):
 
     @property
     def angular_subspace(self) -> tuple[tuple[float, float, float], ...]:
-        """The axes about which it can turn its child, see `linkax.model.immobile_rows`."""
+        """Axes about which it can turn its child, for `linkax.model.immobile_rows`."""
         return tuple(map(tuple, np.eye(3)[[strain for strain in self.strains if strain < 3]]))
 
     @property
     def linear_subspace(self) -> tuple[tuple[float, float, float], ...]:
-        """The directions in which it can move its child, likewise."""
+        """Directions in which it can move its child, likewise."""
         bends = [strain for strain in self.strains if strain in (1, 2)]
         stretches = [strain - 3 for strain in self.strains if strain >= 3]
         across = [3 - strain for strain in bends]
@@ -143,9 +147,9 @@ class OnBeam(AbstractJoint):
 
 
 class BeamSegment(OnBeam):
-    """From the first node of an element to a section of it, at a `place` from 0 to 1.
+    """The joint from the first node of an element to a section of it, at a `place` from 0 to 1.
 
-    The one that has the beam's name has the strains of all nodes as coordinates.
+    The one with the beam's name has the strains at all nodes as coordinates.
     """
 
     place: Scalar | float
@@ -169,7 +173,7 @@ class BeamSegment(OnBeam):
 
 
 class SleevePart(OnBeam):
-    """A part of `Sliding`, in one element. The last one has the sleeve's name and its coordinate."""
+    """The part of a `Sliding` in one element. The last part has the sleeve's name and its coordinate."""
 
     sleeve: str = eqx.field(static=True)
 
@@ -200,18 +204,18 @@ class SleevePart(OnBeam):
 
 
 class Sliding(OnBeam):
-    """A sleeve on a beam that bends: the child slides along the bent axis and turns with its sections.
+    """A sleeve on a flexible beam: the child slides along the bent axis and turns with its sections.
 
-    Coordinate: distance [m] of the child's frame from the beam's base along the axis, unstretched. The
-    child's frame has the axes of the section where it is. It is always in the tree. For a pad or a wheel,
-    which does not turn with the section, put a massless body on the sleeve and another joint on that.
-    Beyond its ends the beam goes on as its last elements end.
+    Coordinate: distance [m] of the child's frame from the beam's base, along the unstretched axis. The child's frame
+    has the axes of the section where it is. The joint is always in the tree. A pad or a wheel does not turn with the
+    section: put a massless body on the sleeve, and another joint on that body. Beyond its ends the beam goes on as
+    its first and last elements do.
 
-    A mechanism takes it apart into parts, one for each element, with massless bodies such as "sleeve[1]"
-    between them; the last part keeps its name, its coordinate and its reaction.
+    A mechanism splits the joint into parts, one for each element, with massless bodies such as "sleeve[1]" between
+    them. The last part keeps its name, its coordinate and its reaction.
 
-    **Arguments:** `name`, unique among joints; `beam`, a `linkax.Beam`; `child`: a body (its reference
-    frame) or `body.at(...)`.
+    **Arguments:** `name`: unique among joints; `beam`: a `linkax.Beam`; `child`: a body (its reference frame) or
+    `body.at(...)`.
     """
 
     def __init__(self, name: str, beam: Beam, child: BodyOrFrame):
