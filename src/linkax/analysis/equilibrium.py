@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import ArrayLike, Bool, Float, Int
 
 from linkax.analysis.steady import (
     AGREES,
@@ -33,6 +33,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED, LONGEST_STEP
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
 from linkax.xla.derivatives import pushforward
 from linkax.xla.tracing import all_concrete, evaluate_now, quick_compile

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike, Float
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import rates
@@ -21,6 +21,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import by_joint, checked_state, checked_time, marked
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import concrete, quick_compile
 
 JointKey = str | tuple[str, int]

@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
+from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
 
 GROWS = 1e-6  # |Re λ| / |λ| up to which a motion neither grows nor decays

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import ArrayLike, Bool, Float, Int
 
 from linkax.equations.system import system_of
 from linkax.formulations.constraint_split import ConstraintSplit
@@ -18,6 +18,7 @@ from linkax.simulation.integrate.options import check_accuracy
 from linkax.simulation.integrate.run import DEFAULT_FORMULATION, checked_formulation
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import quick_compile
 
 INVOLVED = 1e-6  # entry of a self-stress of magnitude one up to which its row counts as not part of it

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
@@ -22,6 +22,7 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
+from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete

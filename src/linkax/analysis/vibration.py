@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike, Float
 
 from linkax.analysis.linearisation import Linearisation, gyroscopic_frequencies, state_matrix
 from linkax.analysis.steady import (
@@ -36,6 +36,7 @@ from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.initial_state import moving_joints
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import all_concrete, concrete, quick_compile
 
 NEAR = 1e-6  # distance from an equilibrium up to which a state counts as in it [rad, lengths of the mechanism]

@@ -72,7 +72,7 @@ class RunOptions:
         else:
             self.solver = SOLVERS[arguments.solver]()
         self.points = self.scene.points(self.parameters)
-        self.display_name = {
+        self.described = {
             "scene": self.scene.name,
             "variant": self.variant,
             "t1": self.t1,

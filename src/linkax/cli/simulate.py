@@ -42,7 +42,7 @@ def add_command(commands: Any) -> None:
 def _simulate(arguments) -> int:
     """Simulate, write the files, print a summary, and return the exit code."""
     asked, chosen = RunOptions(arguments), formulation(arguments.formulation)
-    settings = asked.display_name | {"formulation": arguments.formulation}
+    settings = asked.described | {"formulation": arguments.formulation}
     out = output_folder(arguments.out, asked.scene.name, settings, ("summary.json", PART[1]))
     at_interrupt_in(out)
     run = simulate_in_segments(

@@ -29,7 +29,7 @@ Axis = str | Vector
 
 Kind = TypeVar("Kind")
 Word = TypeVar("Word", bound=str)
-Kinds = type | tuple[type, ...]
+Kinds = Any  # a class, or several, as `isinstance` takes them
 
 
 class Constant(eqx.Module):

@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from linkax.model.numbers import require_type
 from linkax.studies.files import writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
 from linkax.studies.free_parameters import FreeParameters
 from linkax.studies.progress import progress_bar
+from linkax.xla.arrays import Array
 
 FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
 Mode = Literal["forward", "reverse"]

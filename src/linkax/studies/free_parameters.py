@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from linkax.model.numbers import is_finite, real, require
 from linkax.studies.parameters import AbstractParameter
 from linkax.studies.progress import path_parts
+from linkax.xla.arrays import Array
 
 
 class FreeParameters(eqx.Module):
@@ -45,7 +46,9 @@ class FreeParameters(eqx.Module):
             _check(path, leaf)
             for inner, part in jax.tree.leaves_with_path(leaf.value if isinstance(leaf, AbstractParameter) else leaf):
                 names += _names((*path, *inner), jnp.shape(part))
-        leaves = [leaf if isinstance(leaf, AbstractParameter) else jnp.asarray(leaf, float) for leaf in leaves]
+        leaves: list[Array | AbstractParameter] = [
+            leaf if isinstance(leaf, AbstractParameter) else jnp.asarray(leaf, float) for leaf in leaves
+        ]
         leaf_names = [_names(path, ())[0] for path in paths]
         return FreeParameters(leaves, list(map(_scales, leaves)), structure, names, leaf_names)
 
@@ -60,7 +63,8 @@ class FreeParameters(eqx.Module):
 
     def params(self, z: Float[Array, " p"]) -> Any:
         """The argument of the user's function, at z."""
-        free = [part * scale for part, scale in zip(ravel_pytree(self._starts())[1](z), self.scales, strict=True)]
+        restored: Any = ravel_pytree(self._starts())[1]
+        free = [part * scale for part, scale in zip(restored(z), self.scales, strict=True)]
         values = [
             leaf.value_of(x) if isinstance(leaf, AbstractParameter) else x
             for leaf, x in zip(self.leaves, free, strict=True)

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike, Float
 
 from linkax.model.bodies import inertia_tensor
 from linkax.model.numbers import is_finite, namespace, number, real, require
+from linkax.xla.arrays import Array
 
 
 class AbstractParameter(eqx.Module):
@@ -60,8 +60,8 @@ class Bounded(AbstractParameter):
     """
 
     value: Float[Array, "..."]
-    lower: Float[Array | np.ndarray, ""]
-    upper: Float[Array | np.ndarray, ""]
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
 
     def __init__(self, value: ArrayLike | Sequence, lower: ArrayLike, upper: ArrayLike):
         self.lower, self.upper = (number(bound, (), "Bounded: bound") for bound in (lower, upper))
@@ -83,9 +83,9 @@ class Inertia(NamedTuple):
     - `inertia`: tensor about the centre of mass, (3, 3) [kg m²].
     """
 
-    mass: Float[Array | np.ndarray, ""]
-    center_of_mass: Float[Array | np.ndarray, "3"]
-    inertia: Float[Array | np.ndarray, "3 3"]
+    mass: Float[Array, ""]
+    center_of_mass: Float[Array, "3"]
+    inertia: Float[Array, "3 3"]
 
 
 class PhysicalInertia(AbstractParameter):
@@ -110,7 +110,8 @@ class PhysicalInertia(AbstractParameter):
     ):
         m = number(mass, (), "PhysicalInertia: mass [kg]")
         center = number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]")
-        tensor = inertia_tensor(inertia, "PhysicalInertia: inertia [kg m²]")
+        matrix: Any = inertia
+        tensor = inertia_tensor(matrix, "PhysicalInertia: inertia [kg m²]")
         smallest = _least(_pseudo_inertia(m, center, tensor))
         remedy = (
             f"no body with extent along all axes has it and inertia {inertia} kg m²; all principal moments must be "

@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.model.numbers import is_finite, namespace, real, require, require_type
 from linkax.studies.parameters import as_arrays
+from linkax.xla.arrays import Array
 
 
 class Shots(NamedTuple):
@@ -23,7 +23,7 @@ class Shots(NamedTuple):
     gaps: Any
 
 
-def shoot(run: Callable, starts: Any, ts: Float[Array | np.ndarray, " n_t"] | Sequence[float]) -> Shots:
+def shoot(run: Callable, starts: Any, ts: Float[Array, " n_t"] | Sequence[float]) -> Shots:
     """Run a long record as several motions, each from a start of its own: multiple shooting.
 
     The residual of a long or chaotic motion has many minima, that of short pieces has few. Make the starts parameters

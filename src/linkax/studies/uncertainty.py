@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.studies.free_parameters import FreeParameters
+from linkax.xla.arrays import Array
 
 NO_INFLUENCE = 1e-10  # sensitivity of a parameter, relative to the largest, up to which it has no influence
 DEPENDENT = 1e-8  # diagonal entry of R, relative to the largest, up to which it is rounding of the derivatives

@@ -6,7 +6,7 @@ steps itself needs seven copies.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -136,8 +136,8 @@ def _within(solver: ProjectedSolver, t0, t1, dense, t):
 def tangents_over_steps(solver, every, ivp, steps, tangents: InitialValueProblem) -> Trajectory:
     """JVP of a run, step by step from the first: tangents of its states; None among `tangents` is zero."""
     y0, last = ivp.y0, steps.count - 1
-    saved: Any = ivp.saved
-    saved_dot: Any = None if saved is None else materialise(saved, tangents.saved)
+    saved = cast(Any, ivp.saved)
+    saved_dot = cast(Any, None if saved is None else materialise(saved, tangents.saved))
 
     def step(sides, problem, t0, t1, y):
         return _step(solver, problem, t0, t1, y, sides)
@@ -180,7 +180,7 @@ def cotangents_over_steps(solver, ivp, steps, wanted, cotangent: Trajectory) -> 
     """VJP of a run, step by step from the last: cotangents of the leaves of `ivp` that are `wanted`."""
     problem, fixed = eqx.partition(ivp.problem, wanted.problem)
     last = steps.count - 1
-    saved: Any = ivp.saved
+    saved = cast(Any, ivp.saved)
     saved_cotangent: Any = cotangent.saved
 
     of_problem = lambda problem: eqx.combine(problem, fixed)
