@@ -170,7 +170,7 @@ class Beam(AbstractBody):
         return require(offset, inside, what, f"its distance from the base must be from {begin} m to {end} m")
 
     @property
-    def element_length(self) -> Scalar:
+    def element_length(self) -> Float[Array | np.floating, "*batch"]:
         """Length of an element [m]."""
         return self.length / self.elements
 

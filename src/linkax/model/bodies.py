@@ -32,12 +32,12 @@ class Frame(eqx.Module):
     """A frame fixed to a body, made by `body.at(...)`.
 
     - `body`: the name of the body.
-    - `offset`: its origin in the body's reference frame [m], shape (3,).
+    - `offset`: its origin in the body's reference frame [m], shape (3,), or (..., 3) of a batch of mechanisms.
     - `rotation`: its axes as columns, in the body's axes, shape (3, 3).
     """
 
     body: str = eqx.field(static=True)
-    offset: Float[Array, "3"]
+    offset: Float[Array, "*batch 3"]
     rotation: Constant | Float[Array, "3 3"]
 
 

@@ -37,7 +37,7 @@ def _along_element(
     **Arguments:** `first`, `second`: strains at its nodes × its `length`, (6,) each; `end`: where the section is, from
     0 to 1.
     """
-    slope, straight = second - first, length * np.eye(NUM_STRAINS)[3]
+    slope, straight = second - first, length * np.eye(NUM_STRAINS, dtype=first.dtype)[3]
     begin, slope = screw_matrix(first + straight), screw_matrix(slope)
     middle, slope = end * (begin + end / 2.0 * slope), end**2 * slope
     turned = _bracket(middle, slope)
