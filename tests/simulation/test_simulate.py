@@ -10,7 +10,7 @@ import pytest
 import linkax as lx
 from linkax.cli import progress_run
 from linkax.scenes import SCENES
-from linkax.simulation.read import solution
+from linkax.simulation.read import reading
 from linkax.simulation.read.observables import Observables
 
 
@@ -95,15 +95,15 @@ def test_a_time_saved_more_than_once_holds_one_state():
 def test_a_reading_is_computed_once(monkeypatch):
     mechanism, computed = pendulum(), []
     found = lx.simulate(mechanism, lx.assemble(mechanism, {"pivot": 0.3}), t1=1.0)
-    compute = solution._of_times
-    watched = lambda of, *given, **how: computed.append(of) or compute(of, *given, **how)
-    monkeypatch.setattr(solution, "_of_times", watched)
+    choose = reading._of_times.choose
+    watched = lambda quick, of, *given: computed.append(of) or choose(quick, of, *given)
+    monkeypatch.setattr(reading._of_times, "choose", watched)
     first, again = found.reaction("pivot"), found.reaction("pivot")
     np.testing.assert_array_equal(first.force, again.force)
     assert computed == [Observables.solve, Observables.reactions]
     found.violation()
     assert computed[2:] == [Observables.violation_and_scales]
-    of_all, each = solution._of_solutions, id(found)
+    of_all, each = reading._of_solutions, id(found)
     assert each in of_all
     del found
     assert each not in of_all

@@ -5,7 +5,7 @@ acceleration, so γ must lie in the range of J: uᵀγ(v, v) = 0 for every u wit
 equations for the speeds, whose solutions are the branches.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -105,3 +105,16 @@ class ConstraintSplit(eqx.Module):
         opened = jnp.stack([opening(*island) for island in self.configuration.system.structure.islands])
         driven = self._driven(jnp.where(from_rest, jnp.sqrt(scale), scale))
         return outside[:, 0] + self._outside(driven), self.inverse.rank + opened
+
+
+class AtRest(NamedTuple):
+    """Acceleration from rest at a configuration, and what selects its branch.
+
+    - `split`: see `ConstraintSplit`. `mass`: M. `acceleration`: v̇ at v = 0.
+    - `definiteness`: of M on the tangent space, see `linkax.linalg.constrained_solve.SaddleInverse`.
+    """
+
+    split: ConstraintSplit
+    mass: Float[Array, "n_v n_v"]
+    acceleration: Float[Array, " n_v"]
+    definiteness: Float[Array, ""]

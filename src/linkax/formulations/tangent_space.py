@@ -6,7 +6,7 @@ formed; accelerations and multipliers follow from the same split. `notebooks/met
 formula.
 """
 
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ from linkax.equations.loops import gamma, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations import projected_state
-from linkax.formulations.constraint_split import ConstraintSplit
+from linkax.formulations.constraint_split import AtRest, ConstraintSplit
 from linkax.formulations.formulation import AbstractFormulation, Dynamics, LinearSystem, linear_system
 from linkax.linalg.block_elimination import BlockInverse, SaddlePointInFronts, invert_by_blocks, with_identity_metric
 from linkax.linalg.constrained_solve import (
@@ -39,19 +39,6 @@ from linkax.xla.arrays import Array
 from linkax.xla.tracing import jit_inline
 
 Metric = Literal["mass", "identity"]
-
-
-class AtRest(NamedTuple):
-    """Acceleration from rest at a configuration, and what selects its branch.
-
-    - `split`: see `ConstraintSplit`. `mass`: M. `acceleration`: v̇ at v = 0.
-    - `definiteness`: of M on the tangent space, see `linkax.linalg.constrained_solve.SaddleInverse`.
-    """
-
-    split: ConstraintSplit
-    mass: Float[Array, "n_v n_v"]
-    acceleration: Float[Array, " n_v"]
-    definiteness: Float[Array, ""]
 
 
 class TangentSpace(AbstractFormulation):

@@ -1,8 +1,7 @@
 """The motion that a simulation found, and what can be read from it."""
 
-import weakref
 from collections.abc import Callable
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
@@ -11,9 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from linkax.equations.reactions import Axes, Reaction, Side
-from linkax.equations.system import system_of
-from linkax.formulations.formulation import AbstractFormulation, Dynamics
-from linkax.formulations.tangent_space import TangentSpace
+from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import number, one_of, real, require
@@ -21,19 +18,16 @@ from linkax.simulation.explain.error_estimate import refined_run
 from linkax.simulation.explain.remarks import remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
 from linkax.simulation.integrate.integrate import Outcome, integrate_run
-from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.options import check_accuracy
-from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.results import REMARKS, RESULTS
 from linkax.simulation.integrate.run import Run, checked_formulation
 from linkax.simulation.read.observables import Observables, Pose, Power, Violation
 from linkax.simulation.read.passages import Passages, passages
+from linkax.simulation.read.reading import evaluate_dense, read, read_in_motion
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program, all_concrete, concrete
-
-FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
+from linkax.xla.tracing import concrete
 
 
 class Solution(eqx.Module):
@@ -58,18 +52,18 @@ class Solution(eqx.Module):
     """
 
     run: Run
-    ts: Float[Array, "*batch n_t"]
-    q: Float[Array, "*batch n_t n_q"] | None
-    v: Float[Array, "*batch n_t n_v"] | None
+    ts: Float[Array, "*batch n_t"] | Any
+    q: Float[Array, "*batch n_t n_q"] | Any
+    v: Float[Array, "*batch n_t n_v"] | Any
     ys: Any
     t_end: Float[Array, "*batch"]
     end: State
     stats: dict[str, Any]
     result: Any
     rank_nearby: Int[Array, "*batch k"] | None
-    closest: Float[Array, "*batch"]
-    average: Float[Array, "*batch"]
-    definiteness: Float[Array, "*batch"]
+    closest: Float[Array, "*batch"] | np.floating
+    average: Float[Array, "*batch"] | np.floating
+    definiteness: Float[Array, "*batch"] | np.floating
     interpolation: Any
 
     @property
@@ -158,15 +152,15 @@ class Solution(eqx.Module):
 
     def orientation(self, body: str) -> Float[Array, "*batch n_t 3 3"]:
         """Axes of a body's reference frame, as columns."""
-        return _over_times(Observables.orientation, self, self._body(body))
+        return read(Observables.orientation, self, self._body(body))
 
     def angular_velocity(self, body: str) -> Float[Array, "*batch n_t 3"]:
         """Angular velocity of a body [rad/s]."""
-        return _over_times(Observables.angular_velocity, self, self._body(body))
+        return read(Observables.angular_velocity, self, self._body(body))
 
     def poses(self) -> dict[str, Pose]:
         """Reference frames of all bodies by name, of a beam those of its sections: what an animation needs."""
-        origin, axes = _over_times(Observables.poses, self)
+        origin, axes = read(Observables.poses, self)
         names = enumerate(self.mechanism.topology.bodies)
         return {name: Pose(origin[..., index, :], axes[..., index, :, :]) for index, name in names}
 
@@ -185,8 +179,8 @@ class Solution(eqx.Module):
             raise ValueError(f"body {beam!r} is no beam, and has no strain")
         return found.strain(self.joint(beam))
 
-    def reaction(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
-        """What a joint or a constraint does.
+    def reaction(self, name: str, *, on: Side = "child", axes: Axes = "ground") -> Any:
+        """The reaction of a joint, or the force of a constraint.
 
         **Arguments:**
 
@@ -206,7 +200,7 @@ class Solution(eqx.Module):
             return self._of_constraint(Observables.constraint_forces, name)
         return self._of_joint(Observables.reactions, name, on, axes)
 
-    def reaction_unique(self, name: str, *, on: Side = "child", axes: Axes = "ground"):
+    def reaction_unique(self, name: str, *, on: Side = "child", axes: Axes = "ground") -> Any:
         """Which components of `reaction` the mechanics determine, as booleans of the same shapes.
 
         A component is unique where no self-stress of the redundant constraints changes it
@@ -219,7 +213,7 @@ class Solution(eqx.Module):
 
     def reactions(self) -> dict[str, Reaction]:
         """The reactions of all joints on their children, in ground axes, by name."""
-        force, moment = _in_motion(Observables.reactions, self, "child", "ground")
+        force, moment = read_in_motion(Observables.reactions, self, "child", "ground")
         names = enumerate(self.mechanism.topology.joints)
         return {name: Reaction(force[..., index, :], moment[..., index, :]) for index, name in names}
 
@@ -229,19 +223,19 @@ class Solution(eqx.Module):
 
     def kinetic_energy(self) -> Float[Array, "*batch n_t"]:
         """Kinetic energy [J]."""
-        return _over_times(Observables.kinetic_energy, self)
+        return read(Observables.kinetic_energy, self)
 
     def potential_energy(self) -> Float[Array, "*batch n_t"]:
         """Potential energy of the force elements that have one [J]."""
-        return _over_times(Observables.potential_energy, self)
+        return read(Observables.potential_energy, self)
 
     def power(self) -> Power:
         """The rate of `energy`, by what causes it [W], each (n_t,)."""
-        return _in_motion(Observables.power, self)
+        return read_in_motion(Observables.power, self)
 
     def violation(self) -> Violation:
         """Largest violation of the loop rows at each time."""
-        return _in_motion(Observables.violation_and_scales, self)[0]
+        return read_in_motion(Observables.violation_and_scales, self)[0]
 
     def worst_violation(self) -> Violation:
         """Over all times, relative: to the run's largest speed and acceleration where those apply.
@@ -250,7 +244,7 @@ class Solution(eqx.Module):
         joints in radians and lengths of the mechanism; the square of a speed counts as an
         acceleration, since uniform motion of the joints accelerates the bodies.
         """
-        violation, speed, acceleration = _in_motion(Observables.violation_and_scales, self)
+        violation, speed, acceleration = read_in_motion(Observables.violation_and_scales, self)
         largest = lambda values: jnp.max(jnp.where(jnp.isfinite(self.ts), values, 0.0), axis=-1)
         relative = lambda values, scale: values / jnp.where(scale > 0.0, scale, 1.0)
         return Violation(
@@ -261,11 +255,11 @@ class Solution(eqx.Module):
 
     def rank(self) -> Int[Array, "*batch n_t"]:
         """Number of independent loop rows."""
-        return _over_times(Observables.rank, self)
+        return read(Observables.rank, self)
 
     def singularity_distance(self) -> Float[Array, "*batch n_t"]:
         """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
-        return _over_times(Observables.distance, self)
+        return read(Observables.distance, self)
 
     def error_estimate(self, reading: "Callable[[Solution], Any] | None" = None, *, factor: Any = 1e-2):
         """How far this run is off, found by a second one that is more accurate.
@@ -317,14 +311,14 @@ class Solution(eqx.Module):
         if first is not None and last is not None and first.shape == ():
             during = lambda t: (t >= first) & (t <= last)
             t = require(t, during, "t [s]", f"give a time of the run, from {first} s to {last} s")
-        return _evaluate(self.mechanism, self.formulation, self.accuracy, self.rank_nearby, self.interpolation, t)
+        return evaluate_dense(self.mechanism, self.formulation, self.accuracy, self.rank_nearby, self.interpolation, t)
 
     def _is_constraint(self, name):
         return isinstance(name, str) and name in self.mechanism.topology.constraints
 
     def _of_constraint(self, function, name):
         """Force of one constraint; computed for all, so that names share one program."""
-        return _in_motion(function, self)[..., self.mechanism.topology.constraints.index(name)]
+        return read_in_motion(function, self)[..., self.mechanism.topology.constraints.index(name)]
 
     def _of_joint(self, function, name, on, axes):
         """Reaction of one joint; computed for all, so that names share one program."""
@@ -332,7 +326,7 @@ class Solution(eqx.Module):
             one_of(entry, choices, what)
         self.mechanism.joint(name)
         index = self.mechanism.topology.joints.index(name)
-        force, moment = _in_motion(function, self, on, axes)
+        force, moment = read_in_motion(function, self, on, axes)
         return Reaction(force[..., index, :], moment[..., index, :])
 
     def _body(self, name):
@@ -349,16 +343,16 @@ class Solution(eqx.Module):
     def _of_point(self, function, body, at):
         """Read a function of `Observables` for a point of a rigid body or of a beam."""
         found = self.mechanism.body(body)
-        read = _in_motion if function is Observables.acceleration else _over_times
+        reader = read_in_motion if function is Observables.acceleration else read
         if at is None and isinstance(found, Beam):
             sections = np.stack([*map(self._index, found.sections)], axis=-1)
-            return read(Observables.center_of_mass, self, function, sections)
+            return reader(Observables.center_of_mass, self, function, sections)
         if at is None and not isinstance(found, Beam):
-            return read(function, self, self._index(body), found.center_of_mass)
+            return reader(function, self, self._index(body), found.center_of_mass)
         if isinstance(at, str):
             frame = found.at(at)
             offset = jnp.broadcast_to(frame.offset, (*self.ts.shape[:-1], 3))
-            return read(function, self, self._index(frame.body), offset)
+            return reader(function, self, self._index(frame.body), offset)
         what = f"point on body {body!r} [m]"
         offset = real(at, what)
         if isinstance(found, Beam) and offset.shape == ():
@@ -367,12 +361,12 @@ class Solution(eqx.Module):
         offset = found.within(offset, what) if isinstance(found, Beam) else offset
         offset = jnp.broadcast_to(offset, (*self.ts.shape[:-1], 3))
         if isinstance(found, Beam):
-            return read(Observables.on_beam, self, function, found, offset)
-        return read(function, self, self._index(body), offset)
+            return reader(Observables.on_beam, self, function, found, offset)
+        return reader(function, self, self._index(body), offset)
 
     def _joint(self, function, name):
         self.mechanism.joint(name)
-        values = _over_times(function, self, name)
+        values = read(function, self, name)
         return values[..., 0] if values.shape[-1] == 1 else values
 
 
@@ -392,82 +386,3 @@ def _difference(solution, reading, factor):
     for _ in range(solution.ts.ndim - 1):
         of_member = eqx.filter_vmap(of_member)
     return of_member(solution)
-
-
-def _in_motion(function, solution, *details):
-    """`_over_times` of a function that needs accelerations or multipliers, for which all such share a program."""
-    return _over_times(function, solution, *details, dynamics=_over_times(Observables.solve, solution))
-
-
-def _over_times(function, solution, *details, dynamics=()):
-    """Evaluate a function of `Observables` at all times of all members of a batch."""
-    if solution.q is None:
-        raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
-    topology, run = solution.mechanism.topology, solution.run
-    few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
-    motion = SavedMotion(run.mechanism, run.formulation, run.tangent_space, solution.rank_nearby, *_states(solution))
-    given = function, motion, dynamics, details
-    read = lambda: _of_times.choose(few, *given)(*given)
-    named = all(isinstance(detail, str) for detail in details)
-    if not named or solution.ts.ndim > 1 or not all_concrete(solution):
-        return read()
-    return _kept(solution, (function, *details), read)
-
-
-class SavedMotion(NamedTuple):
-    """What is read: with another solver or tolerance the same program reads it."""
-
-    mechanism: Mechanism
-    formulation: AbstractFormulation
-    tangent_space: TangentSpace
-    rank_nearby: Int[Array, "*batch k"] | None
-    ts: Float[Array, "*batch n_t"]
-    q: Float[Array, "*batch n_t n_q"]
-    v: Float[Array, "*batch n_t n_v"]
-
-
-def _states(solution):
-    return solution.ts, solution.q, solution.v
-
-
-_of_solutions = {}  # what has been read from solutions that are alive, by their identity
-
-
-def _kept(solution, key, read):
-    """What `read` gives, once for a solution, while it lives: other names and readings ask for the same."""
-    if id(solution) not in _of_solutions:
-        _of_solutions[id(solution)] = {}
-        weakref.finalize(solution, _of_solutions.pop, id(solution))
-    kept = _of_solutions[id(solution)]
-    if key not in kept:
-        kept[key] = read()
-    return kept[key]
-
-
-@Program
-def _of_times(function, motion: SavedMotion, dynamics, details):
-    def of_member(motion, dynamics, details):
-        dtype = motion.q.dtype
-        system = system_of(motion.mechanism, dtype, fixed_scales=False)
-        tangent_space = motion.tangent_space.prepared(dtype, motion.rank_nearby)
-        method = motion.formulation.prepared(dtype, motion.rank_nearby)
-
-        def of_time(t, q, v, *dynamics):
-            found = Dynamics(*dynamics) if dynamics else None
-            return function(Observables(system, method, tangent_space, t, q, v, found), *details)
-
-        return map_saved_times(of_time, jnp.isfinite(motion.ts), motion.ts, motion.q, motion.v, *dynamics)
-
-    for _ in range(motion.ts.ndim - 1):
-        of_member = eqx.filter_vmap(of_member)
-    return of_member(motion, dynamics, details)
-
-
-@eqx.filter_jit
-def _evaluate(mechanism, formulation, accuracy, rank_nearby, interpolation, t):
-    dtype = interpolation.t0.dtype
-    t = jnp.asarray(t, dtype)
-    y = interpolation.evaluate(t)
-    return Problem(mechanism, system_of(mechanism, dtype), formulation.prepared(dtype, rank_nearby), accuracy).close(
-        t, y
-    )

@@ -1,0 +1,99 @@
+"""Reading a solution: functions of `Observables` over all its times and members, each kept while the solution lives."""
+
+import weakref
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Float, Int
+
+from linkax.equations.system import system_of
+from linkax.formulations.formulation import AbstractFormulation, Dynamics
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.mechanism import Mechanism
+from linkax.simulation.integrate.map_saved_times import map_saved_times
+from linkax.simulation.integrate.problem import Problem
+from linkax.simulation.read.observables import Observables
+from linkax.xla.arrays import Array
+from linkax.xla.tracing import Program, all_concrete
+
+FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
+
+
+def read_in_motion(function, solution, *details):
+    """`read` of a function that needs accelerations or multipliers, for which all such share a program."""
+    return read(function, solution, *details, dynamics=read(Observables.solve, solution))
+
+
+def read(function, solution, *details, dynamics=()):
+    """Evaluate a function of `Observables` at all times of all members of a batch."""
+    if solution.q is None:
+        raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
+    topology, run = solution.mechanism.topology, solution.run
+    few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
+    motion = SavedMotion(run.mechanism, run.formulation, run.tangent_space, solution.rank_nearby, *_states(solution))
+    given = function, motion, dynamics, details
+    compute = lambda: _of_times.choose(few, *given)(*given)
+    named = all(isinstance(detail, str) for detail in details)
+    if not named or solution.ts.ndim > 1 or not all_concrete(solution):
+        return compute()
+    return _kept(solution, (function, *details), compute)
+
+
+class SavedMotion(NamedTuple):
+    """What is read: with another solver or tolerance the same program reads it."""
+
+    mechanism: Mechanism
+    formulation: AbstractFormulation
+    tangent_space: TangentSpace
+    rank_nearby: Int[Array, "*batch k"] | None
+    ts: Float[Array, "*batch n_t"]
+    q: Float[Array, "*batch n_t n_q"]
+    v: Float[Array, "*batch n_t n_v"]
+
+
+def _states(solution):
+    return solution.ts, solution.q, solution.v
+
+
+_of_solutions = {}  # what has been read from solutions that are alive, by their identity
+
+
+def _kept(solution, key, compute):
+    """What `compute` gives, once for a solution, while it lives: other names and readings ask for the same."""
+    if id(solution) not in _of_solutions:
+        _of_solutions[id(solution)] = {}
+        weakref.finalize(solution, _of_solutions.pop, id(solution))
+    kept = _of_solutions[id(solution)]
+    if key not in kept:
+        kept[key] = compute()
+    return kept[key]
+
+
+@Program
+def _of_times(function, motion: SavedMotion, dynamics, details):
+    def of_member(motion, dynamics, details):
+        dtype = motion.q.dtype
+        system = system_of(motion.mechanism, dtype, fixed_scales=False)
+        tangent_space = motion.tangent_space.prepared(dtype, motion.rank_nearby)
+        method = motion.formulation.prepared(dtype, motion.rank_nearby)
+
+        def of_time(t, q, v, *dynamics):
+            found = Dynamics(*dynamics) if dynamics else None
+            return function(Observables(system, method, tangent_space, t, q, v, found), *details)
+
+        return map_saved_times(of_time, jnp.isfinite(motion.ts), motion.ts, motion.q, motion.v, *dynamics)
+
+    for _ in range(motion.ts.ndim - 1):
+        of_member = eqx.filter_vmap(of_member)
+    return of_member(motion, dynamics, details)
+
+
+@eqx.filter_jit
+def evaluate_dense(mechanism, formulation, accuracy, rank_nearby, interpolation, t):
+    dtype = interpolation.t0.dtype
+    t = jnp.asarray(t, dtype)
+    y = interpolation.evaluate(t)
+    return Problem(mechanism, system_of(mechanism, dtype), formulation.prepared(dtype, rank_nearby), accuracy).close(
+        t, y
+    )
