@@ -141,48 +141,49 @@ def equilibrium(mechanism: Mechanism, state: State, *, t: ArrayLike = 0.0) -> St
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
     moves = may_move(state) and any(constraint.is_driven for constraint in mechanism.constraints)
-    found, ending = _equilibrium(mechanism, state, t, moves)
+    reached, ending = _equilibrium(mechanism, state, t, moves)
     if not moves:
         # Concrete inside transformations too: whoever reads the state sees that nothing moves.
-        found = State(found.q, evaluate_now(jnp.zeros, found.v.shape, found.v.dtype))
-    if not all_concrete((found, ending)):
-        return State(marked(mechanism, jnp.where(ending.is_sound, found.q, jnp.nan)), found.v)
-    _check_steady(mechanism, ending, found, t)
+        reached = State(reached.q, evaluate_now(jnp.zeros, reached.v.shape, reached.v.dtype))
+    if not all_concrete((reached, ending)):
+        return State(marked(mechanism, jnp.where(ending.is_sound, reached.q, jnp.nan)), reached.v)
+    _check_steady(mechanism, ending, reached, t)
     if not ending.gap <= CLOSED:
         raise EquilibriumError(
             f"the loops stay open by {float(ending.gap):.3g}, in radians or lengths of the mechanism; start from a "
             "state made with linkax.assemble, which says which joint is open",
-            found,
+            reached,
         )
     if not ending.longest <= BALANCED_STEP:
         raise EquilibriumError(
             f"no equilibrium near this state: step {MOST_STEPS} was still one of {float(ending.longest):.3g}, in "
             "radians or lengths of the mechanism; start elsewhere, or add what holds the mechanism",
-            found,
+            reached,
         )
     if ending.unstable:
-        raise EquilibriumError("the equilibrium found is unstable, and no way leads on from it; start elsewhere", found)
+        told = "the equilibrium found is unstable, and no way leads on from it; start elsewhere"
+        raise EquilibriumError(told, reached)
     if ending.circulatory:
         remedy = "see the eigenvalues of linkax.linearise there"
         message = f"the equilibrium may be unstable: some of the forces have no potential; {remedy}"
         warnings.warn(message, StabilityWarning, stacklevel=2)
-    return found
+    return reached
 
 
-def _check_steady(mechanism, ending, found, t):
+def _check_steady(mechanism, ending, reached, t):
     """Raise an EquilibriumError where drives do not move steadily."""
     still = "give a state with speeds of zero, for the equilibrium where drives hold"
     missed = np.asarray(ending.missed)
     misses = np.logical_not(missed <= AGREES)
     if np.any(misses):
         told = of_missed_rate(mechanism, missed, int(np.argmax(misses)), t)
-        raise EquilibriumError(f"{told}, or {still}", found)
+        raise EquilibriumError(f"{told}, or {still}", reached)
     if ending.longest <= BALANCED_STEP and not ending.changes <= AGREES:
         driven = [constraint.display_name for constraint in mechanism.constraints if constraint.is_driven]
         raise EquilibriumError(
             f"no equilibrium lasts while {' and '.join(driven)} goes on: forces or loops change by "
             f"{float(ending.changes):.3g} of the largest; {still}, or drive at a constant rate what changes neither",
-            found,
+            reached,
         )
 
 

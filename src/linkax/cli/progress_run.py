@@ -50,7 +50,7 @@ def simulate_in_segments(
     t1: int | float,
     accuracy: Accuracy = BALANCED,
     solver: diffrax.AbstractSolver | None = None,
-    formulation: str | AbstractFormulation = DEFAULT_FORMULATION,
+    formulation: str | AbstractFormulation | None = DEFAULT_FORMULATION,
     step: int | float | None = None,
     intervals: int = DEFAULT_INTERVALS,
     report: Callable[[str, float | None], None] = lambda phase, fraction: None,

@@ -18,7 +18,7 @@ from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.forces import Load
 from linkax.model.joints.bending import section_at
-from linkax.model.numbers import value
+from linkax.model.numbers import Number, value
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX
 from linkax.spatial.rotations import compose, rotate, transpose
@@ -46,7 +46,7 @@ class Configuration(eqx.Module):
     """
 
     system: System
-    t: Float[Array, ""]
+    t: Number
     q: Float[Array, " n_q"]
     rotation: Float[Array, "n_frames 3 3"]
     link: Float[Array, "n_b 3"]

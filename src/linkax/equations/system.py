@@ -1,5 +1,7 @@
 """The numbers of a mechanism, stacked in the order of its bodies and joints."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,6 @@ from jaxtyping import Float
 
 from linkax.equations.structure import Structure, structure_of
 from linkax.model.constraints import AbstractConstraint, LinearConstraint
-from linkax.model.forces import AbstractForce
 from linkax.model.joints.joint import RelativeMotion
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
@@ -30,6 +31,7 @@ class System(eqx.Module):
       joints, (n, k); None for the others.
     - `loop_length` [m] (n_cut,): half the way around each loop, the unit of its translation rows.
     - `length` [m]: the mechanism's length, the unit of sliding coordinates.
+    - `forces`: force elements, or such held on one side of their switch.
     - `coupling` (k, n_v): coefficients of the constraints on coordinates of the tree, and
       `coupling_unit` (k,): the largest of each, in radians and lengths of the mechanism; `length` for ropes.
     """
@@ -44,13 +46,13 @@ class System(eqx.Module):
     parent_axes: Float[Array, "n_j 3 3"]
     child_axes: Float[Array, "n_j 3 3"]
     joint_parameter: Float[Array, " n_j"]
-    group_parameters: tuple[Float[Array, "n k"] | None, ...]
+    group_parameters: tuple[Float[Array, "_ _"] | None, ...]
     loop_length: Float[Array, " n_cut"]
     length: Float[Array, ""]
     coupling: Float[Array, "k n_v"]
     coupling_unit: Float[Array, " k"]
     constraints: tuple[AbstractConstraint, ...]
-    forces: tuple[AbstractForce, ...]
+    forces: tuple[Any, ...]
 
     @property
     def dtype(self):

@@ -11,6 +11,7 @@ import linkax as lx
 from linkax.model.numbers import Number
 from linkax.scenes.closed_form import turned_link
 from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.xla.arrays import Array
 
 
 def _mechanism(parameters: Parameters) -> lx.Mechanism:
@@ -47,7 +48,7 @@ def _parallel(count: int, turn: Number) -> dict[str, Number]:
     )
 
 
-def _exact(parameters: Parameters, times: np.ndarray) -> dict[str, np.ndarray] | None:
+def _exact(parameters: Parameters, times: Array) -> dict[str, np.ndarray] | None:
     """Couplers only translate, so that the row moves like a pendulum of N + 1 links and N masses at their ends."""
     count, length = parameters["N"], parameters["length"]
     weight, inertia = (count + 1) / 2 + count, (count + 1) / 3 + count

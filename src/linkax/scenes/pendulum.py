@@ -5,6 +5,7 @@ import numpy as np
 import linkax as lx
 from linkax.scenes.closed_form import turned_link
 from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.xla.arrays import Array
 
 
 def _mechanism(parameters: Parameters) -> lx.Mechanism:
@@ -21,7 +22,7 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     return lx.assemble(mechanism, {"pivot": parameters["angle"]}, {"pivot": parameters["speed"]})
 
 
-def _exact(parameters: Parameters, times: np.ndarray) -> dict[str, np.ndarray] | None:
+def _exact(parameters: Parameters, times: Array) -> dict[str, np.ndarray] | None:
     length = parameters["length"]
     link = turned_link(times, parameters["gravity"] / length, parameters["angle"], parameters["speed"])
     return None if link is None else {"bob": length * link}

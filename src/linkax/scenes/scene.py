@@ -61,7 +61,7 @@ class Scene:
     mechanism: Callable[[Parameters], Mechanism]
     initial: Callable[[Mechanism, Parameters], State]
     points: Callable[[Parameters], dict[str, tuple[str, str | None]]]
-    exact: Callable[[Parameters, np.ndarray], dict[str, np.ndarray] | None] | None = None
+    exact: Callable[[Parameters, np.ndarray], dict[str, np.ndarray] | Any] | Any = None
 
     def variant(self, name: str | None = None) -> Variant:
         """Return the variant of that name, by default the default one.

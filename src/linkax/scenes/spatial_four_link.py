@@ -12,6 +12,7 @@ import numpy as np
 import linkax as lx
 from linkax.scenes.closed_form import turned_link
 from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.xla.arrays import Array
 
 
 def _mechanism(parameters: Parameters) -> lx.Mechanism:
@@ -35,7 +36,7 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     return lx.assemble(mechanism, turning(parameters["angle"]), turning(parameters["speed"]))
 
 
-def _exact(parameters: Parameters, times: np.ndarray) -> dict[str, np.ndarray] | None:
+def _exact(parameters: Parameters, times: Array) -> dict[str, np.ndarray] | None:
     """The coupler only translates, so that the rhombus moves like a pendulum: 5/3 m l² α̈ = −2 m g l cos α."""
     length = parameters["length"]
     stiffness = 1.2 * parameters["gravity"] / length

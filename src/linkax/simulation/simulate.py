@@ -1,12 +1,13 @@
 """Simulation: from a mechanism and a state to a motion in time."""
 
 import warnings
+from typing import Any
 
 import diffrax
 
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import require_bool
+from linkax.model.numbers import Number, require_bool
 from linkax.simulation.explain.diagnosis import cause
 from linkax.simulation.explain.remarks import in_words
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
@@ -22,19 +23,19 @@ def simulate(
     mechanism: Mechanism,
     state: State,
     *,
-    t1,
-    t0=0.0,
+    t1: Number,
+    t0: Number = 0.0,
     accuracy: Accuracy = BALANCED,
-    formulation: str | AbstractFormulation = DEFAULT_FORMULATION,
+    formulation: str | AbstractFormulation | None = DEFAULT_FORMULATION,
     saveat: diffrax.SaveAt | None = None,
     solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
-    dt0=None,
-    max_steps: int = DEFAULT_MAX_STEPS,
+    dt0: Number | None = None,
+    max_steps: int | None = DEFAULT_MAX_STEPS,
     adjoint: diffrax.AbstractAdjoint | None = None,
     event: diffrax.Event | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
-    dtype=None,
+    dtype: Any = None,
     optimise: bool = True,
     throw: bool = True,
 ) -> Solution:

@@ -56,12 +56,12 @@ def compare(
     *,
     t1: int | float,
     steppings: Sequence[Stepping],
-    formulations: Mapping[str, AbstractFormulation] | Sequence[str] = COMPARED,
+    formulations: Mapping[str, AbstractFormulation | None] | Sequence[str] = COMPARED,
     exact: Callable[[np.ndarray], Mapping[str, np.ndarray] | None] | None = None,
     bound: int | float | None = None,
     repeats: int = 3,
     report: Callable[[str, float | None], None] = lambda phase, fraction: None,
-    keep: Callable[[Comparison], None] = lambda found: None,
+    keep: Callable[[Comparison], None] = lambda comparison: None,
 ) -> Comparison:
     """Integrate the same motion from 0 to t1 [s] by several formulations.
 

@@ -29,9 +29,9 @@ class Fit(NamedTuple):
 
     params: Any
     loss: float
-    residual: np.ndarray | None
+    residual: np.ndarray | Any
     names: list[str]
-    covariance: np.ndarray | None
+    covariance: np.ndarray | Any
     noise: float | None
     undetermined: list[str]
     history: dict[str, np.ndarray]

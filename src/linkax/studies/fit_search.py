@@ -25,6 +25,7 @@ from linkax.xla.arrays import Array
 
 FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
 Mode = Literal["forward", "reverse"]
+Step = tuple[Float[Array, " p"], Any, Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]
 
 
 def _linearised(function, z, mode=None):
@@ -58,9 +59,7 @@ class AbstractSearch(eqx.Module):
         """The solver's state at z."""
 
     @abc.abstractmethod
-    def step(
-        self, z: Float[Array, " p"], state: Any, args: tuple
-    ) -> tuple[Float[Array, " p"], Any, Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    def step(self, z: Float[Array, " p"], state: Any, args: tuple) -> Step:
         """The next z and state, a loss, whether its derivative is finite, and whether the search has converged.
 
         The loss is that at the next z for `Squares`, and at this z for `Descent`.
@@ -90,11 +89,11 @@ class Squares(AbstractSearch):
 
         return residual
 
-    def begin(self, z, args):
+    def begin(self, z: Float[Array, " p"], args: tuple) -> Any:
         shape = jax.eval_shape(self.flat, z, args)
         return self.solver.init(self._residual(), z, args, {"jac": "bwd"}, shape, None, frozenset())
 
-    def step(self, z, state, args):
+    def step(self, z: Float[Array, " p"], state: Any, args: tuple) -> Step:
         z, state, _ = self.solver.step(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
         done, _ = self.solver.terminate(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
         smooth = jnp.all(jnp.isfinite(state.f_info.jac.as_matrix()))
@@ -104,10 +103,10 @@ class Squares(AbstractSearch):
 class Descent(AbstractSearch):
     """Steps of an optimiser of optax, which never tells that it has converged."""
 
-    def begin(self, z, args):
+    def begin(self, z: Float[Array, " p"], args: tuple) -> Any:
         return self.solver.init(z)
 
-    def step(self, z, state, args):
+    def step(self, z: Float[Array, " p"], state: Any, args: tuple) -> Step:
         def loss(z):
             value = self.flat(z, args)
             return value[0] if self.is_loss else 0.5 * jnp.sum(value**2)

@@ -1,9 +1,11 @@
 """The method of Levenberg and Marquardt, built on optimistix, with damping that does not depend on units."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import optimistix as optx
+from jaxtyping import Array, Bool
 
 from linkax.studies.uncertainty import NO_INFLUENCE
 
@@ -87,7 +89,9 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         self.norm, self.verbose = optx.max_norm, _silent
         self.descent, self.search = _ScaledDescent(), _DelayedDamping(rtol)
 
-    def terminate(self, fn, y, args, options, state, tags):
+    def terminate(
+        self, fn: Callable, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         done, result = super().terminate(fn, y, args, options, state, tags)
         return done | state.search_state[1], result
 

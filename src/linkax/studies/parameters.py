@@ -44,10 +44,10 @@ class Positive(AbstractParameter):
         self.value = _checked("Positive", value, lambda value: value > 0.0, "must be positive")
 
     @property
-    def free(self):
+    def free(self) -> Float[Array, "..."]:
         return jnp.log(self.value)
 
-    def value_of(self, free):
+    def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.exp(free)
 
 
@@ -69,11 +69,11 @@ class Bounded(AbstractParameter):
         self.value = _checked("Bounded", value, inside, f"must lie between {lower} and {upper}")
 
     @property
-    def free(self):
+    def free(self) -> Float[Array, "..."]:
         return jax.scipy.special.logit((self.value - self.lower) / (self.upper - self.lower))
 
-    def value_of(self, free):
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(free)
+    def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
+        return jnp.asarray(self.lower + (self.upper - self.lower) * jax.nn.sigmoid(free))
 
 
 class Inertia(NamedTuple):
@@ -121,16 +121,15 @@ class PhysicalInertia(AbstractParameter):
         self.value = Inertia(m, center, tensor)
 
     @property
-    def free(self):
+    def free(self) -> Float[Array, "10"]:
         # U from the Cholesky factor of the matrix with the order of its rows and columns reversed.
         upper = jnp.linalg.cholesky(_pseudo_inertia(*self.value)[::-1, ::-1])[::-1, ::-1]
         size = upper[3, 3]
         u = upper / size
         return jnp.array([jnp.log(size), *jnp.log(jnp.diagonal(u)[:3]), u[0, 1], u[1, 2], u[0, 2], *u[:3, 3]])
 
-    def value_of(self, free):
-        size, *rest = free
-        d1, d2, d3, s12, s23, s13, t1, t2, t3 = rest
+    def value_of(self, free: Float[Array, "10"]) -> Inertia:
+        size, d1, d2, d3, s12, s23, s13, t1, t2, t3 = free
         zero, one = jnp.zeros_like(size), jnp.ones_like(size)
         rows = [[jnp.exp(d1), s12, s13, t1], [zero, jnp.exp(d2), s23, t2], [zero, zero, jnp.exp(d3), t3]]
         u = jnp.exp(size) * jnp.array([*rows, [zero, zero, zero, one]])

@@ -21,7 +21,7 @@ from linkax.simulation.integrate.results import REMARKS, WARNINGS
 from linkax.simulation.read.solution import Solution
 from linkax.studies.parameters import as_arrays
 from linkax.studies.progress import progress_bar
-from linkax.studies.sweep_program import Program, is_struct
+from linkax.studies.sweep_program import SweepProgram, is_struct
 from linkax.studies.sweep_result import FINE, NOT_RUN, Sweep
 from linkax.studies.sweep_store import SweepStore
 from linkax.xla.enumerations import code, is_item, item
@@ -87,7 +87,7 @@ def sweep(
         if folder is not None:
             SweepStore.check("output", eqx.filter(shape, is_struct))
         order = _order(difficulty, params, count, dict(chunk=chunk, memory=memory, devices=devices))
-        program = Program.compiled(function, one, shape, chunk or min(DEFAULT_CHUNK, count), memory, devices)
+        program = SweepProgram.compiled(function, one, shape, chunk or min(DEFAULT_CHUNK, count), memory, devices)
         bar.set_description("sweeping")
         kept = None if folder is None else SweepStore.opened(folder, program, params, order, NOT_RUN)
         results, seconds, ran = _run(program, params, order, kept, bar)

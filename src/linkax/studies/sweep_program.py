@@ -15,7 +15,7 @@ from linkax.studies.sweep_result import FINE, NOT_FINITE_OUTPUT, REASONS
 from linkax.xla.enumerations import code, is_item
 
 
-class Program(NamedTuple):
+class SweepProgram(NamedTuple):
     """The function, compiled for `size` members at once.
 
     - `outputs`: shapes of its arrays. `static`: the part of its output that is no array.
@@ -40,7 +40,9 @@ class Program(NamedTuple):
         return 1 if _calls_lapack_for_batches(self.text) else _cores()
 
     @staticmethod
-    def compiled(function: Callable, one: Any, shape: Any, chunk: int, memory: int | float, devices: list) -> "Program":
+    def compiled(
+        function: Callable, one: Any, shape: Any, chunk: int, memory: int | float, devices: list
+    ) -> "SweepProgram":
         """Compile for parameters of one member like `one`, and an output like `shape`, in no more than `memory`."""
         static = eqx.partition(shape, is_struct)[1]
         while True:
@@ -55,7 +57,7 @@ class Program(NamedTuple):
                 run = lowered.compile()
             used = _memory(run)
             if used <= memory or chunk == 1:
-                return Program(run, size, lowered.out_info, static, text)
+                return SweepProgram(run, size, lowered.out_info, static, text)
             chunk = max(1, int(0.9 * chunk * memory / used))
 
 

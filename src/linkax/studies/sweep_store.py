@@ -15,7 +15,7 @@ from zarr.storage import MemoryStore
 from linkax.studies.files import synced, writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
 from linkax.studies.progress import path_parts
-from linkax.studies.sweep_program import Program
+from linkax.studies.sweep_program import SweepProgram
 
 FORMAT = 2
 LABELLED = ("", "member", "reason", "done")  # arrays whose attributes name the sweep
@@ -68,7 +68,7 @@ class SweepStore(NamedTuple):
                 raise ValueError(f"{what} has type {leaf.dtype}, unknown to Zarr; use float32 or int32, or no store")
 
     @staticmethod
-    def opened(path: Path, program: Program, params: Any, order: np.ndarray, not_run: int) -> "SweepStore":
+    def opened(path: Path, program: SweepProgram, params: Any, order: np.ndarray, not_run: int) -> "SweepStore":
         """Open the store in a folder, or make a new one, whose reasons are all `not_run`.
 
         **Raises:** `ValueError` where the folder holds another sweep.
@@ -164,9 +164,9 @@ def _claim(path, identity, content):
     if _is_free(path):
         with contextlib.suppress(FileExistsError), written_whole(path / "zarr.json", exclusive=True) as file:
             file.write_bytes(content)
-    found = [{name: label.get(name) for name in identity} for label in _identities(path)] or [{}]
-    if identity not in found:
-        differs = ", ".join(name for name in identity if found[0].get(name) != identity[name])
+    present = [{name: label.get(name) for name in identity} for label in _identities(path)] or [{}]
+    if identity not in present:
+        differs = ", ".join(name for name in identity if present[0].get(name) != identity[name])
         raise ValueError(
             f"store {str(path)!r} holds another sweep: its {differs} differ (function, numbers in it, parameters, "
             "chunk or versions have changed); give another folder, or remove this one"

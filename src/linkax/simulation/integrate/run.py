@@ -62,7 +62,7 @@ class _Frozen(eqx.Module):
 
     @staticmethod
     def of(tree) -> "_Frozen":
-        return _Frozen(*eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array | np.ndarray)))
+        return _Frozen(*eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array | np.ndarray | np.generic)))
 
 
 class Run(eqx.Module):
@@ -75,8 +75,8 @@ class Run(eqx.Module):
 
     mechanism: Mechanism
     state: State
-    t0: Float[Array, "*batch"]
-    t1: Float[Array, "*batch"]
+    t0: Float[Array, "*batch"] | float | np.floating
+    t1: Float[Array, "*batch"] | float | np.floating
     formulation: AbstractFormulation
     accuracy: Accuracy
     optimise: bool = eqx.field(static=True)

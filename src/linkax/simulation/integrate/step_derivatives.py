@@ -136,8 +136,8 @@ def _within(solver: ProjectedSolver, t0, t1, dense, t):
 def tangents_over_steps(solver, every, ivp, steps, tangents: InitialValueProblem) -> Trajectory:
     """JVP of a run, step by step from the first: tangents of its states; None among `tangents` is zero."""
     y0, last = ivp.y0, steps.count - 1
-    saved = cast(Any, ivp.saved)
-    saved_dot = cast(Any, None if saved is None else materialise(saved, tangents.saved))
+    saves, saved = ivp.saved is not None, cast(Any, ivp.saved)
+    saved_dot = cast(Any, materialise(saved, tangents.saved) if saves else None)
 
     def step(sides, problem, t0, t1, y):
         return _step(solver, problem, t0, t1, y, sides)
@@ -158,12 +158,12 @@ def tangents_over_steps(solver, every, ivp, steps, tangents: InitialValueProblem
             return j + 1, found.at[j].set(value)
 
         found = motion.saved
-        if saved is not None:
+        if saves:
             j, found = lax.while_loop(lambda carry: _reached(saved, carry[0], ends[1]), save, (j, found))
         return k + 1, j, y, Trajectory(found, y_dot, motion.steps.at[k + 1].set(y_dot) if every else None)
 
     motion = Trajectory(
-        saved=None if saved is None else jnp.zeros((len(saved), len(y0)), y0.dtype),
+        saved=jnp.zeros((len(saved), len(y0)), y0.dtype) if saves else None,
         end=materialise(y0, tangents.y0),
         steps=jnp.zeros_like(steps.ys).at[0].set(materialise(y0, tangents.y0)) if every else None,
     )
