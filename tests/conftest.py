@@ -2,6 +2,7 @@ import gc
 import os
 import sys
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 # The settings that users have, for tests marked users_settings.
@@ -36,6 +37,18 @@ settings.register_profile("thorough", deadline=None, max_examples=1000)
 settings.load_profile("repeatable")
 
 sys.path.insert(0, str(Path(__file__).parent))
+from unchecked import unchecked  # noqa: E402
+
+_raises = pytest.raises
+
+
+@contextmanager
+def _raises_unchecked(*args, **options):
+    with unchecked(), _raises(*args, **options) as told:
+        yield told
+
+
+pytest.raises = _raises_unchecked
 
 # Files that take longest begin first, so that at the end no process waits for another.
 LONGEST = ("test_notebooks", "test_gradients", "test_known_answers", "test_singular_starts", "test_compiler")

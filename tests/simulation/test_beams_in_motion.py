@@ -37,6 +37,15 @@ def test_energy_of_a_falling_bar():
 
 
 @pytest.mark.slow
+def test_single_precision():
+    mechanism, state = released(), lx.assemble(released())
+    options = {"t1": 0.02, "solver": diffrax.Dopri8(), "accuracy": lx.Accuracy(1e-5)}
+    single = lx.simulate(mechanism, state, dtype=jnp.float32, **options)
+    assert single.q.dtype == jnp.float32
+    np.testing.assert_allclose(single.q, lx.simulate(mechanism, state, **options).q, atol=1e-3)
+
+
+@pytest.mark.slow
 def test_spin_up():
     """A rotating cantilever that is brought up to speed (Kane; Simo and Vu-Quoc, CMAME 66, 1988, figure 6).
 

@@ -116,7 +116,7 @@ def test_from_a_state_that_is_not_sound_no_step_is_taken(monkeypatch):
     for controller in (CONTROLLERS[0], diffrax.ConstantStepSize()):
         *_, result = adapt(controller, FAR)
         assert result == diffrax.RESULTS.successful
-        monkeypatch.setattr(ARGS, "sound", False)
+        monkeypatch.setattr(ARGS, "can_start", False)
         keep, *_, result = adapt(controller, FAR)
         assert not keep
         assert result == diffrax.RESULTS.dt_min_reached

@@ -17,12 +17,12 @@ import pytest
 from refusals import refused
 
 import linkax as lx
-from linkax.studies.sweep_program import Program
+from linkax.studies.sweep_program import SweepProgram
 from linkax.studies.sweep_store import LABELLED, SweepStore
 
 MEMBERS, CHUNK = 10, 4  # the last chunk has two
 PARAMS = {"a": np.linspace(0.1, 1.0, MEMBERS)}
-COMPILE, OPEN = Program.compiled, SweepStore.opened
+COMPILE, OPEN = SweepProgram.compiled, SweepStore.opened
 
 
 def waves(params):
@@ -62,7 +62,7 @@ def run():
         return Kept(found, set(ran), [str(warning.message) for warning in told])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Program, "compiled", compiled)
+        patch.setattr(SweepProgram, "compiled", compiled)
         yield run
 
 
@@ -225,7 +225,7 @@ def tree(keys, leaf):
 
 @pytest.mark.parametrize("keys", NAMES, ids=ascii)
 def test_names_that_can_be_no_arrays_are_named_before_anything_is_compiled(keys, tmp_path, monkeypatch):
-    monkeypatch.setattr(Program, "compiled", never)
+    monkeypatch.setattr(SweepProgram, "compiled", never)
     (tmp_path / "a").mkdir()
     store = tmp_path / "a" / "store"
     outputs = lambda params: tree(keys, params["a"])
@@ -235,7 +235,7 @@ def test_names_that_can_be_no_arrays_are_named_before_anything_is_compiled(keys,
 
 
 def test_types_unknown_to_zarr_are_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(Program, "compiled", never)
+    monkeypatch.setattr(SweepProgram, "compiled", never)
     for kind in (lambda a: a.astype(jnp.bfloat16), lambda a: jax.random.key(3)):
         refused(lambda kind=kind: lx.sweep(kind, PARAMS["a"], store=tmp_path, progress=False), "store", "output")
 
