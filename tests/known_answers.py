@@ -109,6 +109,30 @@ def crank_slider(parameters, times):
     return solve_ivp(rates, span, start, method="DOP853", rtol=1e-13, atol=1e-16, t_eval=times).y
 
 
+END = 1.0
+ROD = SCENES["crank-slider"].settings(None, {"rod": 2.0, "angle": np.pi / 4})
+
+
+@functools.cache
+def slider_start():
+    """The start of `slider_end`, to be called once before any transformation calls that."""
+    scene = SCENES["crank-slider"]
+    return scene.initial(scene.mechanism(ROD), ROD)
+
+
+def slider_end(mass):
+    """Where the slider is after a second, by the rod's mass."""
+    mechanism = SCENES["crank-slider"].mechanism(ROD | {"rod_mass": mass})
+    return lx.simulate(mechanism, slider_start(), t1=END).position("slider")[-1, 0]
+
+
+def known_slider_end(mass):
+    """The same from one equation of the crank's angle."""
+    angle, _ = crank_slider(ROD | {"rod_mass": mass}, np.array([0.0, END]))[:, -1]
+    crank, rod = ROD["crank"], ROD["rod"]
+    return crank * np.cos(angle) + np.sqrt(rod**2 - (crank * np.sin(angle)) ** 2)
+
+
 class Known(NamedTuple):
     """A run whose motion is known.
 
