@@ -36,6 +36,7 @@ from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.initial_state import moving_joints
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import all_concrete, concrete, quick_compile
 
@@ -95,8 +96,8 @@ class _Moving(Nearby):
     def opens(self):
         """The largest gap of the loops, rate that speeds miss, or slope at which T opens the loops."""
         slopes = jacobian(configure(self.system, self.t, self.q)) @ self.basis
-        longest = jnp.max(jnp.abs(self.basis / self.system.scales[:, None]), initial=0.0)
-        apart = jnp.max(jnp.abs(slopes), initial=0.0) / jnp.where(longest > 0.0, longest, 1.0)
+        longest = largest(self.basis / self.system.scales[:, None])
+        apart = largest(slopes) / jnp.where(longest > 0.0, longest, 1.0)
         misses = missed_rates(self.system, self.t, self.q, self.v)
         gap = widest_gap(self.system, self.t, self.q)
         return jnp.maximum(jnp.maximum(apart, gap), jnp.max(misses, initial=0.0))

@@ -13,6 +13,7 @@ from linkax.model.constraints import AbstractConstraint, LinearConstraint
 from linkax.model.joints.joint import RelativeMotion
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
+from linkax.spatial.vectors import largest
 from linkax.spatial.vectors import length as length_of
 from linkax.xla.arrays import Array
 
@@ -70,7 +71,7 @@ class System(eqx.Module):
 
     def fastest(self, v) -> Float[Array, ""]:
         """The largest speed of v, (n_v,), or change, in radians and lengths of the mechanism: max |v / scales|."""
-        return jnp.max(jnp.abs(v / self.scales), initial=0.0)
+        return largest(v / self.scales)
 
 
 def system_of(mechanism: Mechanism, dtype, fixed_scales: bool = True) -> System:

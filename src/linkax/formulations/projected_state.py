@@ -224,5 +224,5 @@ def _gap(system, t, q):
 
 def _inertia(system):
     """Of the magnitude of the mechanism's [kg m²]: multipliers over it are of that of accelerations."""
-    found = jnp.sum(system.mass) * system.length**2 + jnp.max(jnp.abs(system.inertia), initial=0.0)
+    found = jnp.sum(system.mass) * system.length**2 + largest(system.inertia)
     return lax.stop_gradient(jnp.where(found > 0.0, found, 1.0))

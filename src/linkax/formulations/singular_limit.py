@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
+from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.primitives import bounded_while_loop
@@ -122,7 +123,6 @@ def singular_limit(function, powers, arguments, direction: Direction):
     one = jnp.ones((), q.dtype)
     start = _Trip(jnp.zeros((), int), zeros, pairs, one, one)
     trip = bounded_while_loop(unfinished, body, start, max_steps=LAST + 1)
-    largest = lambda array: jnp.max(jnp.abs(array), initial=0.0)
     scales = [largest(pair[0]) + fastest**power for pair, power in zip(trip.sums, powers, strict=True)]
     smooth = [
         largest(differences) <= tolerance * scale

@@ -4,6 +4,7 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 
+from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.options import save_at, with_tolerances
 from linkax.simulation.integrate.run import DEFAULT_SAVES, Run, cast
 from linkax.simulation.start.state import State
@@ -26,14 +27,9 @@ def refined_run(solution, factor) -> Run:
         raise ValueError(f"steps of {type(options.controller).__name__} cannot be refined; use an adaptive controller")
     finer = lambda rtol: jnp.maximum(factor * rtol, FINEST)
     controller, accuracy = with_tolerances(finer, (options.controller, accuracy))
-    mechanism, state, t0, accuracy = cast((run.mechanism, run.state, run.t0, accuracy), jnp.dtype(float))
     ts = jnp.where(jnp.isfinite(solution.ts), solution.ts, solution.t_end)
-    return run.changed(
-        mechanism=mechanism,
-        state=state,
-        t0=t0,
+    return _in_double(run, run.state, accuracy).changed(
         t1=solution.t_end,
-        accuracy=accuracy,
         saveat=save_at(ts),
         controller=controller,
         dt0=dt0,
@@ -42,12 +38,19 @@ def refined_run(solution, factor) -> Run:
 
 
 def part_of_run(solution, state: State, ts) -> Run:
-    """The motion from a state at the first of some times to the last, saved there, with the same options.
+    """The motion from a state at the first of some times to the last, saved there, in double precision.
 
     By the same program where the run of the solution saves as many.
     """
     padded = np.pad(ts, (0, num_saves(solution) - len(ts)), mode="edge")
-    return solution.run.changed(state=state, t0=ts[0], t1=ts[-1], saveat=save_at(padded))
+    run = _in_double(solution.run, state, solution.accuracy)
+    return run.changed(t0=ts[0], t1=ts[-1], saveat=save_at(padded))
+
+
+def _in_double(run: Run, state: State, accuracy: Accuracy) -> Run:
+    """A run from a state at an accuracy, in double precision."""
+    mechanism, state, t0, accuracy = cast((run.mechanism, state, run.t0, accuracy), jnp.dtype(float))
+    return run.changed(mechanism=mechanism, state=state, t0=t0, accuracy=accuracy)
 
 
 def num_saves(solution) -> int:

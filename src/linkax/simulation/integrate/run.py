@@ -126,9 +126,10 @@ class Run(eqx.Module):
     @property
     def has_discrete_adjoint(self) -> bool:
         """Whether derivatives go over the accepted steps: the default where it can be."""
-        solver, saveat, event, max_steps = (getattr(self.options, name) for name in _DECIDE)
-        default = self.options.adjoint is None and saveat is not None
-        return default and saves_states(saveat) and has_discrete_adjoint(solver, saveat, event, max_steps)
+        options = self.options
+        if options.adjoint is not None or options.saveat is None or not saves_states(options.saveat):
+            return False
+        return has_discrete_adjoint(options.solver, options.saveat, options.event, options.max_steps)
 
     @property
     def adjoint(self) -> diffrax.AbstractAdjoint:
@@ -158,9 +159,6 @@ class Run(eqx.Module):
         """What a solution keeps: to run it again, or a part of it, without the functions of a user."""
         dt0, solver, controller, max_steps, *_ = self.options
         return dataclasses.replace(self, _options=_Frozen.of(DiffraxOptions(dt0, solver, controller, max_steps)))
-
-
-_DECIDE = ("solver", "saveat", "event", "max_steps")
 
 
 def checked_formulation(formulation, accuracy: Accuracy | None = None) -> AbstractFormulation:

@@ -31,7 +31,8 @@ def read(function, solution, *details, dynamics=()):
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
     topology, run = solution.mechanism.topology, solution.run
     few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
-    motion = SavedMotion(run.mechanism, run.formulation, run.tangent_space, solution.rank_nearby, *_states(solution))
+    states = solution.ts, solution.q, solution.v
+    motion = SavedMotion(run.mechanism, run.formulation, run.tangent_space, solution.rank_nearby, *states)
     given = function, motion, dynamics, details
     compute = lambda: _of_times.choose(few, *given)(*given)
     named = all(isinstance(detail, str) for detail in details)
@@ -50,10 +51,6 @@ class SavedMotion(NamedTuple):
     ts: Float[Array, "*batch n_t"]
     q: Float[Array, "*batch n_t n_q"]
     v: Float[Array, "*batch n_t n_v"]
-
-
-def _states(solution):
-    return solution.ts, solution.q, solution.v
 
 
 _of_solutions = {}  # what has been read from solutions that are alive, by their identity
