@@ -152,6 +152,19 @@ def test_max_steps_keeps_the_part_computed():
     np.testing.assert_allclose(solution.q[reached], whole.q[reached], atol=1e-12)
 
 
+@pytest.mark.parametrize("ends", [{"t0": True}, {"t1": True}, {"t0": True, "t1": True}])
+def test_start_and_end_are_saved_beside_given_times(ends):
+    mechanism, times = pendulum(), [0.25, 0.5]
+    state = lx.assemble(mechanism, {"pivot": 0.3})
+    found = lx.simulate(mechanism, state, t1=1.0, saveat=diffrax.SaveAt(ts=times, **ends))
+    ts = [*[0.0] * ends.get("t0", False), *times, *[1.0] * ends.get("t1", False)]
+    each = lx.simulate(mechanism, state, t1=1.0, saveat=diffrax.SaveAt(ts=ts))
+    np.testing.assert_array_equal(found.ts, ts)
+    np.testing.assert_allclose(found.q, each.q, atol=1e-14)
+    np.testing.assert_allclose(found.v, each.v, atol=1e-14)
+    assert found.error_estimate(lambda solution: solution.q).shape == found.q.shape
+
+
 def test_every_step_saved_is_read_and_no_room_beyond():
     """Rows that were never saved are no numbers, and parts of the rows give what all at once give."""
     mechanism = pendulum()

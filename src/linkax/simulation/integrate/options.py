@@ -94,7 +94,9 @@ def check_saved_times(saveat, t0, t1, max_steps):
 
 def saves_times(saveat) -> bool:
     """Whether states are saved at given times, and nothing else."""
-    return jax.tree.structure(saveat) == jax.tree.structure(save_at(np.zeros(1)))
+    if jax.tree.structure(saveat) != jax.tree.structure(save_at(np.zeros(1))):
+        return False
+    return not (saveat.subs.t0 or saveat.subs.t1 or saveat.subs.steps)
 
 
 def save_at(ts: Any) -> diffrax.SaveAt:
