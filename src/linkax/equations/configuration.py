@@ -7,7 +7,7 @@ need products along the way. Featherstone, Rigid Body Dynamics Algorithms (2008)
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, Real
 
 from linkax.equations.coordinates import coordinates_by_speed
 from linkax.equations.joint_motions import joint_motions
@@ -20,10 +20,10 @@ from linkax.model.forces import Load
 from linkax.model.joints.bending import section_at
 from linkax.model.numbers import Number, value
 from linkax.model.terms import Term
-from linkax.model.topology import GROUND_INDEX
+from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import jit_inline
 
 
@@ -107,11 +107,13 @@ class Configuration(eqx.Module):
         (near, near_anchor), (far, far_anchor) = self._place(first), self._place(second)
         return (far - near) + (far_anchor - near_anchor)
 
-    def point_load(self, frame: Frame, force, moment=0.0) -> Load:
+    def point_load(self, frame: Frame, force: Real[Array, "3"], moment: Real[Array, "3"] | float = 0.0) -> Load:
         """Make the load of a force at a frame's origin, and a moment, in ground axes [N, N m]; none on the ground."""
         return self.wrench(self.body(frame.body), self.arm(frame), force, moment)
 
-    def wrench(self, body: int, arm, force, moment) -> Load:
+    def wrench(
+        self, body: int, arm: Float[Array, "3"], force: Real[Array, "3"], moment: Real[Array, "3"] | float
+    ) -> Load:
         """Make the load of a force at a point of a body, and a moment [N, N m]."""
         none = Load.none(self.system)
         if body == GROUND_INDEX:
@@ -127,7 +129,7 @@ class Configuration(eqx.Module):
         kind, axes, cut = self._cut(name)
         return kind.measure(axes.T @ self.child_axes[cut], axes.T @ self.separation[cut])
 
-    def joint_displacement(self, term: Term, origin) -> Float[Array, ""]:
+    def joint_displacement(self, term: Term, origin: Number) -> Float[Array, ""]:
         """A joint's coordinate less an origin [rad or m]; angles of a cut joint in [−π, π)."""
         index, topology = term.index or 0, self.system.topology
         if term.joint in topology.speeds:
@@ -143,7 +145,7 @@ class Configuration(eqx.Module):
         cut = joint - topology.num_bodies
         return topology.cut_types[cut], self.joint_axes[joint], cut
 
-    def cut_subspace(self, name: str):
+    def cut_subspace(self, name: str) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """Motion subspace of a cut joint in ground axes, angular and linear part, (n, 3) each.
 
         Its columns dotted with the relative twist are the joint's speeds; as wrenches they are forces along the joint.
@@ -156,12 +158,14 @@ class Configuration(eqx.Module):
         return angular @ axes.T, linear @ axes.T
 
 
-def wrapped(angles, is_angle):
+def wrapped(angles: Scalar, is_angle: bool | Bool[Array, ""]) -> Float[Array, ""]:
     """Bring differences of angles into [−π, π); leave lengths as they are."""
     return jnp.where(is_angle, jnp.mod(angles + jnp.pi, 2.0 * jnp.pi) - jnp.pi, angles)
 
 
-def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " n_v"]:
+def along_speeds(
+    configuration: Configuration, force: Float[Array, "n_b 3"], moment: Float[Array, "n_b 3"]
+) -> Float[Array, " n_v"]:
     """Project wrenches on bodies, (n_b, 3) each, moments about the centre of mass, on the speeds: Σ Sᵀ w."""
     system, topology = configuration.system, configuration.system.topology
     body = topology.moved_body
@@ -170,7 +174,7 @@ def along_speeds(configuration: Configuration, force, moment) -> Float[Array, " 
     return sum_by_speed(topology, dot(configuration.linear, force[body]) + dot(configuration.angular, moment[body]))
 
 
-def beam_point(configuration: Configuration, beam: Beam, point) -> Float[Array, "3"]:
+def beam_point(configuration: Configuration, beam: Beam, point: Float[Array, "3"]) -> Float[Array, "3"]:
     """Position of a point (3,) fixed to the section of a beam at point[0], in the world [m]."""
     nodes = jnp.array([configuration.body(name) for name in beam.nodes])
     coordinates = configuration.joint_coordinates(beam.name)
@@ -180,14 +184,16 @@ def beam_point(configuration: Configuration, beam: Beam, point) -> Float[Array, 
     return configuration.world_position()[node] + configuration.rotation[node] @ seen
 
 
-def bodies_of_cuts(topology):
+def bodies_of_cuts(
+    topology: Topology,
+) -> tuple[Int[np.ndarray, " n_cut"], Int[np.ndarray, " n_cut"], Int[np.ndarray, " n_cut"]]:
     """Parent and child body of each cut joint, and the joints' indices."""
     cuts = np.arange(topology.num_bodies, len(topology.joints))
     return np.array(topology.parent, dtype=int)[cuts], np.array(topology.child, dtype=int)[cuts], cuts
 
 
 @jit_inline
-def configure(system: System, t, q: Float[Array, " n_q"]) -> Configuration:
+def configure(system: System, t: Number, q: Float[Array, " n_q"]) -> Configuration:
     """Compute the poses of all bodies and the motion subspaces of all joints at coordinates q."""
     topology, count = system.topology, system.topology.num_bodies
     parent, child = np.array(topology.parent), np.array(topology.child)

@@ -6,6 +6,7 @@ angular velocity is in axes of the parent.
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from linkax.model.topology import Topology
@@ -26,14 +27,14 @@ def _of_plain(topology, v):
     return scatter_static(jnp.zeros(topology.num_coordinates, v.dtype), topology.plain[:, 0], v[topology.plain[:, 1]])
 
 
-def neutral(topology: Topology, dtype) -> Float[Array, " n_q"]:
+def neutral(topology: Topology, dtype: DTypeLike) -> Float[Array, " n_q"]:
     """Coordinates at which the frames of every joint in the tree coincide."""
     q = np.zeros(topology.num_coordinates)
     q[topology.quaternions[:, 0]] = 1.0
     return jnp.asarray(q, dtype)
 
 
-def retract(topology: Topology, q, change) -> Float[Array, " n_q"]:
+def retract(topology: Topology, q: Float[Array, " n_q"], change: Float[Array, " n_v"]) -> Float[Array, " n_q"]:
     """Add a finite change (n_v,) to coordinates: q ⊕ δ."""
     if not len(topology.quaternions):
         return q + change
@@ -42,7 +43,7 @@ def retract(topology: Topology, q, change) -> Float[Array, " n_q"]:
     return scatter_static(q + _of_plain(topology, change), in_q, turned)
 
 
-def carried(topology: Topology, motion, change) -> Float[Array, " n_v"]:
+def carried(topology: Topology, motion: Float[Array, " n_v"], change: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
     """Carry a small change of q along to q ⊕ motion, (n_v,) each: quaternions turn it."""
     if not len(topology.quaternions):
         return change
@@ -51,7 +52,7 @@ def carried(topology: Topology, motion, change) -> Float[Array, " n_v"]:
     return scatter_static(change, in_v, rotate(turn, change[in_v]))
 
 
-def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:
+def on_manifold(topology: Topology, q: Float[Array, " n_q"]) -> Float[Array, " n_q"]:
     """Normalise the quaternions."""
     if not len(topology.quaternions):
         return q
@@ -59,7 +60,7 @@ def on_manifold(topology: Topology, q) -> Float[Array, " n_q"]:
     return scatter_static(q, in_q, normalised(q[in_q]))
 
 
-def rates(topology: Topology, q, v) -> Float[Array, " n_q"]:
+def rates(topology: Topology, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Float[Array, " n_q"]:
     """q̇ at speeds v."""
     if not len(topology.quaternions):
         return v
@@ -69,7 +70,7 @@ def rates(topology: Topology, q, v) -> Float[Array, " n_q"]:
     return scatter_static(_of_plain(topology, v), in_q, turning)
 
 
-def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
+def speeds(topology: Topology, q: Float[Array, " n_q"], rates: Float[Array, " n_q"]) -> Float[Array, " n_v"]:
     """The speeds v with rates q̇; small changes of q likewise."""
     if not len(topology.quaternions):
         return rates
@@ -78,7 +79,7 @@ def speeds(topology: Topology, q, rates) -> Float[Array, " n_v"]:
     return scatter_static(coordinates_by_speed(topology, rates), in_v, omega)
 
 
-def coordinates_by_speed(topology: Topology, q) -> Float[Array, " n_v"]:
+def coordinates_by_speed(topology: Topology, q: Float[Array, " n_q"]) -> Float[Array, " n_v"]:
     """The coordinate of each speed, (n_v,); zero for those of quaternions."""
     if not len(topology.quaternions):
         return q

@@ -6,6 +6,7 @@ about each one's own reference point, so that small bodies far out on a mechanis
 
 from functools import reduce
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -79,7 +80,9 @@ def applied_load(motion: Motion) -> Load:
     return reduce(Load.plus, loads, Load.none(motion.system))
 
 
-def inertial_wrench(motion: Motion, angular_acceleration, acceleration):
+def inertial_wrench(
+    motion: Motion, angular_acceleration: Float[Array, "n_b 3"], acceleration: Float[Array, "n_b 3"]
+) -> tuple[Float[jax.Array, "n_b 3"], Float[jax.Array, "n_b 3"]]:
     """Force m a [N] and moment I α + ω × I ω about the centre of mass [N m] of each body, (n_b, 3) each.
 
     **Arguments:** accelerations of the bodies [rad/s²] and of their reference points [m/s²].
@@ -123,7 +126,9 @@ def potential_energy(configuration: Configuration) -> Scalar:
     return sum(energies, jnp.zeros((), configuration.system.dtype))
 
 
-def body_accelerations(motion: Motion, acceleration: Float[Array, " n_v"]):
+def body_accelerations(
+    motion: Motion, acceleration: Float[Array, " n_v"]
+) -> tuple[Float[Array, "n_b 3"], Float[Array, "n_b 3"]]:
     """Accelerations of bodies [rad/s²] and of their reference points [m/s²] at v̇, (n_b, 3) each."""
     configuration, system = motion.configuration, motion.system
     acceleration = expand_to_motions(system.topology, acceleration)[:, None]

@@ -36,7 +36,7 @@ def as_if_closed(configuration: Configuration) -> Configuration:
     return eqx.tree_at(lambda c: c.separation, configuration, configuration.separation - apart)
 
 
-def flips(configuration: Configuration):
+def flips(configuration: Configuration) -> tuple[Float[Array, " k"], Float[Array, "k n_v"]]:
     """Rows that are nonzero only where an aligned pair of axes is flipped by 180°, and their Jacobian.
 
     Locked rotations alone would also be satisfied by axes that point opposite ways.

@@ -1,21 +1,27 @@
 """Motions of joints in the tree: rotation, translation and motion subspace of each, in joint axes."""
 
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from linkax.equations.coordinates import coordinates_by_speed
 from linkax.equations.system import System
 from linkax.equations.tree_sums import expand_to_motions, sum_by_body
 from linkax.model.joints.joint import RelativeMotion
+from linkax.model.topology import JointGroup
 from linkax.spatial.screws import turn_rate
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import whole_jacobian
 from linkax.xla.static_scatter import scatter_static
 
 
-def joint_motions(system: System, q):
+def joint_motions(
+    system: System, q: Float[Array, " n_q"]
+) -> tuple[Float[Array, "n_b 3 3"], Float[Array, "n_b 3"], Float[Array, "n_m 3"], Float[Array, "n_m 3"]]:
     """Evaluate all joints of the tree at coordinates q.
 
     **Returns:** rotations, (n_b, 3, 3), and translations, (n_b, 3), of the child's frame in that of the parent; motion
@@ -47,7 +53,9 @@ def joint_motions(system: System, q):
     return turn, shift, angular, linear
 
 
-def over_bending(function, system, read):
+def over_bending(
+    function: Callable[..., tuple[Array, ...]], system: System, read: Callable[[JointGroup], tuple[Array, ...]]
+) -> Iterator[tuple[JointGroup, tuple[Array, ...]]]:
     """Map a function of (`RelativeMotion`, arrays (k,), parameters) over all joints that have such a motion.
 
     Joints with equal motions are one batch, so that the function is traced once for each motion.

@@ -4,6 +4,7 @@ With h₁ⁱ, h₂ʲ the joint's axes on parent and child and s the separation o
 a translation row h₁ⁱ·s / ℓ, ℓ half the way around the loop. Combined rows are functions of several of these.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -33,7 +34,11 @@ class RowVectors(NamedTuple):
     length: Float[Array, " n_tr"]
 
 
-def chosen_rows(configuration: Configuration, rotation_rows, translation_rows) -> RowVectors:
+def chosen_rows(
+    configuration: Configuration,
+    rotation_rows: Sequence[tuple[int, int, int]],
+    translation_rows: Sequence[tuple[int, int]],
+) -> RowVectors:
     rotation = np.array(rotation_rows, dtype=int).reshape(-1, 3)
     translation = np.array(translation_rows, dtype=int).reshape(-1, 2)
     columns, other = transpose(configuration.parent_axes), transpose(configuration.child_axes)
@@ -82,7 +87,7 @@ def combine(system: System, rows: Float[Array, " n"]) -> Float[Array, " n_combin
     return jnp.stack(found)
 
 
-def row_residual(configuration: Configuration, rows: RowVectors):
+def row_residual(configuration: Configuration, rows: RowVectors) -> Float[Array, " n"]:
     rotation = dot(rows.first, rows.second)
     translation = dot(rows.direction, configuration.separation[rows.translation_cut]) / rows.length
     return jnp.concatenate([rotation, translation])
@@ -110,17 +115,17 @@ def row_jacobian(configuration: Configuration, rows: RowVectors) -> StaticSparse
     return found if topology.motion_column is None else StaticSparse.whole(sum_by_speed(topology, found.dense()))
 
 
-def combination(configuration: Configuration):
+def combination(configuration: Configuration) -> tuple[Float[Array, " n"], Float[Array, "n n_v"]]:
     """Values of the rows that combined rows are functions of, and their Jacobian."""
     rows = combined_rows(configuration)
     return row_residual(configuration, rows), row_jacobian(configuration, rows).dense()
 
 
-def combining_factors(configuration: Configuration, values) -> Float[Array, "n_combined n"]:
+def combining_factors(configuration: Configuration, values: Float[Array, " n"]) -> Float[Array, "n_combined n"]:
     return jax.jacfwd(lambda values: combine(configuration.system, values))(values)
 
 
-def row_gamma(motion: Motion, rows: RowVectors):
+def row_gamma(motion: Motion, rows: RowVectors) -> Float[Array, " n"]:
     """γ of rotation and translation rows: minus the terms of c̈ without v̇.
 
     A rotation row has c̈ = n·α + ṅ·ω with n = h₂ʲ × h₁ⁱ and ω, α the child's angular velocity and acceleration relative

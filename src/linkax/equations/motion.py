@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
 from linkax.equations.configuration import Configuration
 from linkax.equations.joint_motions import over_bending
@@ -14,6 +14,7 @@ from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, expand_to_motions, sum_by_body
 from linkax.model.bodies import Frame
 from linkax.model.forces import Load
+from linkax.model.numbers import Number
 from linkax.model.terms import Term
 from linkax.spatial.rotations import rotate
 from linkax.spatial.screws import turn_rate
@@ -48,11 +49,11 @@ class Motion(eqx.Module):
     def system(self) -> System:
         return self.configuration.system
 
-    def joint(self, name: str):
+    def joint(self, name: str) -> Float[Array, ""] | Float[Array, " n"]:
         """Coordinate of a joint, in the tree or cut [rad or m]; (n,) where it has several."""
         return _alone(self.configuration.joint_coordinates(name))
 
-    def joint_speed(self, name: str):
+    def joint_speed(self, name: str) -> Float[Array, ""] | Float[Array, " n"]:
         """Speed of a joint, in the tree or cut [rad/s or m/s]; (n,) where it has several."""
         return _alone(self.joint_speeds(name))
 
@@ -74,7 +75,7 @@ class Motion(eqx.Module):
         """One speed of a joint [rad/s or m/s]."""
         return self.joint_speeds(term.joint)[term.index or 0]
 
-    def joint_load(self, term: Term, force) -> Load:
+    def joint_load(self, term: Term, force: Number) -> Load:
         """Make the load of a torque [N m], or a force [N] on a slide, on the child along one speed of a joint."""
         topology, configuration, none = self.system.topology, self.configuration, Load.none(self.system)
         if term.joint in topology.speeds:
@@ -97,7 +98,7 @@ class Motion(eqx.Module):
         omega = self.angular_velocity[body]
         return self.bias[body] + cross(self.angular_bias[body], arm) + cross(omega, cross(omega, arm))
 
-    def point_load(self, frame: Frame, force, moment=0.0) -> Load:
+    def point_load(self, frame: Frame, force: Real[Array, "3"], moment: Real[Array, "3"] | float = 0.0) -> Load:
         """Make the load of a force at a frame's origin, and a moment, in ground axes [N, N m]; none on the ground."""
         return self.configuration.point_load(frame, force, moment)
 

@@ -32,7 +32,11 @@ class Reaction(NamedTuple):
     moment: Float[Array, "... 3"]
 
 
-def cut_reactions(configuration: Configuration, multipliers, immobile=None) -> Reaction:
+def cut_reactions(
+    configuration: Configuration,
+    multipliers: Float[Array, " m"],
+    immobile: Float[Array, " m_immobile"] | None = None,
+) -> Reaction:
     """Reactions of the cut joints on their children, (n_cut, 3) each, by virtual power: the paper's Table 3.
 
     A rotation row h₁ⁱ·h₂ʲ with multiplier λ is a moment λ h₂ʲ × h₁ⁱ, a translation row h₁ⁱ·s / ℓ a force λ h₁ⁱ / ℓ.
@@ -59,7 +63,7 @@ def _added(reaction: Reaction, rows: RowVectors, multipliers) -> Reaction:
     )
 
 
-def reactions(motion: Motion, acceleration, multipliers) -> Reaction:
+def reactions(motion: Motion, acceleration: Float[Array, " n_v"], multipliers: Float[Array, " m"]) -> Reaction:
     """Reactions of all joints on their children, (n_j, 3) each, tree joints first.
 
     A tree joint carries what its subtree needs: inertial wrenches less applied loads less the reactions
@@ -71,7 +75,9 @@ def reactions(motion: Motion, acceleration, multipliers) -> Reaction:
     return _carried(motion.configuration, needed, cut, multipliers)
 
 
-def reactions_to(configuration: Configuration, multipliers, immobile) -> Reaction:
+def reactions_to(
+    configuration: Configuration, multipliers: Float[Array, " m"], immobile: Float[Array, " m_immobile"]
+) -> Reaction:
     """The part of all reactions that multipliers alone cause, (n_j, 3) each."""
     cut = cut_reactions(configuration, multipliers, immobile)
     return _carried(configuration, Load.none(configuration.system), cut, multipliers)

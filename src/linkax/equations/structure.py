@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from linkax.linalg.elimination_plan import PER_FRONT, EliminationPlan, plan_elimination
 from linkax.model.topology import Topology
+from linkax.xla.arrays import Array
 
 
 class Island(NamedTuple):
@@ -27,7 +29,7 @@ class Structure(NamedTuple):
     islands: tuple[Island, ...]
     elimination: EliminationPlan | None
 
-    def ranks_of_islands(self, ranks):
+    def ranks_of_islands(self, ranks: Int[Array, " k"]) -> Int[Array, " n_islands"]:
         """Add up the ranks of fronts, (k,), for each island; without fronts they are those of islands."""
         plan = self.elimination
         if plan is None:

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from linkax.equations.structure import Structure, structure_of
@@ -56,7 +57,7 @@ class System(eqx.Module):
     forces: tuple[Any, ...]
 
     @property
-    def dtype(self):
+    def dtype(self) -> np.dtype:
         return self.mass.dtype
 
     @property
@@ -69,12 +70,12 @@ class System(eqx.Module):
         """One unit of each speed, or small change: 1 rad, or the mechanism's length [m]."""
         return jnp.where(self.topology.slides, self.length, jnp.ones((), self.dtype))
 
-    def fastest(self, v) -> Float[Array, ""]:
+    def fastest(self, v: Float[Array, " n_v"]) -> Float[Array, ""]:
         """The largest speed of v, (n_v,), or change, in radians and lengths of the mechanism: max |v / scales|."""
         return largest(v / self.scales)
 
 
-def system_of(mechanism: Mechanism, dtype, fixed_scales: bool = True) -> System:
+def system_of(mechanism: Mechanism, dtype: DTypeLike, fixed_scales: bool = True) -> System:
     """Stack the numbers of a mechanism in a floating-point type.
 
     **Arguments:** `fixed_scales`: lengths that serve as scales have no derivative, since no motion depends on them;
