@@ -58,7 +58,7 @@ class RunOptions:
     points: dict[str, tuple[str, str | None]]
     described: dict[str, Any]
 
-    def __init__(self, arguments: argparse.Namespace):
+    def __init__(self, arguments: argparse.Namespace) -> None:
         if arguments.solver == "rk4" and arguments.dt is None:
             raise ValueError("--solver rk4 estimates no error; give its steps by --dt")
         self.scene = scene(arguments.scene)

@@ -105,7 +105,7 @@ class Beam(AbstractBody):
         stretch: bool = True,
         shear: bool = False,
         damping: Number = 0.0,
-    ):
+    ) -> None:
         self.name = body_name(name)
         what = f"beam {name!r}"
         self.length = positive(length, f"{what}: length [m]")
@@ -231,7 +231,7 @@ class BeamElasticity(AbstractForce):
     stiffness: Float[Array, " n"]
     damping: Scalar
 
-    def __init__(self, beam: Beam):
+    def __init__(self, beam: Beam) -> None:
         self.beam, self.elements = beam.name, beam.elements
         self.stiffness = jnp.stack([jnp.asarray(beam.section.stiffness(strain)) for strain in beam.strains])
         self.stiffness = self.stiffness / beam.element_length

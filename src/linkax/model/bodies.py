@@ -110,7 +110,7 @@ class RigidBody(AbstractBody):
         center_of_mass: Vector = (0.0, 0.0, 0.0),
         inertia: Matrix = (0.0, 0.0, 0.0),
         frames: Mapping[str, Vector] | None = None,
-    ):
+    ) -> None:
         self.name = body_name(name)
         self.mass = zero_or_more(mass, f"body {name!r}: mass [kg]")
         self.center_of_mass = number(center_of_mass, (3,), f"body {name!r}: center_of_mass [m]")

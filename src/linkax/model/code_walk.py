@@ -28,7 +28,7 @@ class Undecided(Exception):
 class Same:
     """A value that equals only itself."""
 
-    def __init__(self, value: Any):
+    def __init__(self, value: Any) -> None:
         self.value = value
 
     def __eq__(self, other: object) -> bool:
@@ -105,7 +105,7 @@ class Walk:
     - `numbers`: numbers met so far.
     """
 
-    def __init__(self, names: Iterable[str]):
+    def __init__(self, names: Iterable[str]) -> None:
         self.names, self.numbers = set(names), []
         self._attributes, self._around, self._count, self._is_traced = frozenset(names), [], 0, True
 

@@ -78,7 +78,7 @@ class Coupling(LinearConstraint):
         name: str,
         coefficients: Mapping[str, Number] | Mapping[TermLike, Number],
         offset: Number = 0.0,
-    ):
+    ) -> None:
         self.name = checked_name(name, "coupling")
         if not isinstance(coefficients, Mapping) or not coefficients:
             raise ValueError(f"coupling {name!r}: coefficients are {coefficients!r}; give {{joint: factor, ...}}")
@@ -111,7 +111,7 @@ class Drive(LinearConstraint):
 
     motion: Law
 
-    def __init__(self, name: str, joint: TermLike, motion: Callable[[Any], Number]):
+    def __init__(self, name: str, joint: TermLike, motion: Callable[[Any], Number]) -> None:
         self.name = checked_name(name, "drive")
         self.related = (term(joint, f"drive {name!r}"),)
         self.coefficients = np.ones(1)

@@ -144,7 +144,7 @@ class Gravity(AbstractForce):
 
     acceleration: Float[Array, "3"]
 
-    def __init__(self, acceleration: Vector):
+    def __init__(self, acceleration: Vector) -> None:
         self.acceleration = number(acceleration, (3,), "Gravity: acceleration [m/s²]")
 
     def load(self, t: Time, motion: Motion) -> Load:

@@ -25,7 +25,7 @@ class Function(eqx.Module):
     numbers: tuple[jax.Array, ...]
     code: Code = eqx.field(static=True)
 
-    def __init__(self, function: Callable[..., Any]):
+    def __init__(self, function: Callable[..., Any]) -> None:
         self.code, self.numbers = Code.of(function)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -39,7 +39,7 @@ class Law(eqx.Module):
     shape: tuple[int, ...] = eqx.field(static=True)
     what: str = eqx.field(static=True)
 
-    def __init__(self, function: Callable[..., Any], shape: tuple[int, ...], what: str):
+    def __init__(self, function: Callable[..., Any], shape: tuple[int, ...], what: str) -> None:
         self.function, self.shape, self.what = Function(function), shape, what
 
     def check(self) -> None:

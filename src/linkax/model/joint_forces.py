@@ -44,7 +44,7 @@ class JointTorque(_AlongJoint):
 
     torque: Scalar | Law
 
-    def __init__(self, joint: TermLike, torque: Number | Callable[[Any, Any], Number]):
+    def __init__(self, joint: TermLike, torque: Number | Callable[[Any, Any], Number]) -> None:
         self.joint = term(joint, "JointTorque")
         self.torque = number_or_law(torque, (), f"JointTorque on {self.joint.joint!r}: torque [N m or N]")
 
@@ -65,7 +65,7 @@ class JointSpring(_AlongJoint):
     stiffness: Scalar
     free: Scalar
 
-    def __init__(self, joint: TermLike, stiffness: Number, free: Number = 0.0):
+    def __init__(self, joint: TermLike, stiffness: Number, free: Number = 0.0) -> None:
         self.joint = term(joint, "JointSpring")
         what = f"JointSpring on {self.joint.joint!r}"
         self.stiffness = number(stiffness, (), f"{what}: stiffness [N m/rad or N/m]")
@@ -90,7 +90,7 @@ class JointDamper(_AlongJoint):
 
     damping: Scalar
 
-    def __init__(self, joint: TermLike, damping: Number):
+    def __init__(self, joint: TermLike, damping: Number) -> None:
         self.joint = term(joint, "JointDamper")
         self.damping = number(damping, (), f"JointDamper on {self.joint.joint!r}: damping [N m s/rad or N s/m]")
 
@@ -112,7 +112,7 @@ class JointFriction(_AlongJoint):
     torque: Scalar
     scale: Scalar
 
-    def __init__(self, joint: TermLike, torque: Number, scale: Number):
+    def __init__(self, joint: TermLike, torque: Number, scale: Number) -> None:
         self.joint = term(joint, "JointFriction")
         what = f"JointFriction on {self.joint.joint!r}"
         self.torque = zero_or_more(torque, f"{what}: torque [N m or N]")

@@ -59,7 +59,7 @@ class Mechanism(eqx.Module):
         constraints: Iterable[AbstractConstraint | Distance] = (),
         *,
         all_rows: bool = False,
-    ):
+    ) -> None:
         given = _listed(bodies, joints, forces, constraints)
         parts = discretise_beams(*given)
         body_by_name = _check_names(parts)

@@ -37,7 +37,7 @@ class Constant(eqx.Module):
 
     entries: tuple = eqx.field(static=True)
 
-    def __init__(self, array: np.ndarray):
+    def __init__(self, array: np.ndarray) -> None:
         self.entries = _as_tuples(np.asarray(array, dtype=np.float64).tolist())
 
     @property

@@ -57,7 +57,7 @@ class Spring(_BetweenPoints):
     stiffness: Scalar
     free_length: Scalar
 
-    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, stiffness: Number, free_length: Number = 0.0):
+    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, stiffness: Number, free_length: Number = 0.0) -> None:
         self.first, self.second = _frames("Spring", first, second)
         self.stiffness = number(stiffness, (), f"{self.display_name}: stiffness [N/m]")
         self.free_length = zero_or_more(free_length, f"{self.display_name}: free_length [m]")
@@ -80,7 +80,7 @@ class Damper(_BetweenPoints):
 
     damping: Scalar
 
-    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, damping: Number):
+    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, damping: Number) -> None:
         self.first, self.second = _frames("Damper", first, second)
         self.damping = number(damping, (), f"{self.display_name}: damping [N s/m]")
 
@@ -96,7 +96,7 @@ class _OnPoint(AbstractForce):
     point: Frame
     axes: Axes = eqx.field(static=True)
 
-    def __init__(self, point: BodyOrFrame, axes: Axes):
+    def __init__(self, point: BodyOrFrame, axes: Axes) -> None:
         self.point = frame_of(point, f"{type(self).__name__}: point")
         if self.point.body == GROUND_NAME:
             raise ValueError(
@@ -127,7 +127,7 @@ class PointForce(_OnPoint):
 
     force: Float[Array, "3"] | Law
 
-    def __init__(self, point: BodyOrFrame, force: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground"):
+    def __init__(self, point: BodyOrFrame, force: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground") -> None:
         super().__init__(point, axes)
         self.force = number_or_law(force, (3,), f"{self.display_name}: force [N]")
 
@@ -143,7 +143,9 @@ class PointMoment(_OnPoint):
 
     moment: Float[Array, "3"] | Law
 
-    def __init__(self, point: BodyOrFrame, moment: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground"):
+    def __init__(
+        self, point: BodyOrFrame, moment: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground"
+    ) -> None:
         super().__init__(point, axes)
         self.moment = number_or_law(moment, (3,), f"{self.display_name}: moment [N m]")
 

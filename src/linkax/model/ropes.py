@@ -77,7 +77,7 @@ class Rope(AbstractConstraint):
     points: Points
     length: Scalar | Law
 
-    def __init__(self, name: str, points: Iterable[BodyOrFrame], length: Number | Callable[[Any], Number]):
+    def __init__(self, name: str, points: Iterable[BodyOrFrame], length: Number | Callable[[Any], Number]) -> None:
         self.name = checked_name(name, "rope")
         self.points = _points(points, f"rope {name!r}")
         if callable(length):
@@ -137,7 +137,9 @@ class ElasticRope(AbstractForce):
     free_length: Scalar
     damping: Scalar
 
-    def __init__(self, points: Iterable[BodyOrFrame], stiffness: Number, free_length: Number, damping: Number = 0.0):
+    def __init__(
+        self, points: Iterable[BodyOrFrame], stiffness: Number, free_length: Number, damping: Number = 0.0
+    ) -> None:
         self.points = _points(points, "ElasticRope")
         self.stiffness = positive(stiffness, f"{self.display_name}: stiffness [N/m]")
         self.free_length = positive(free_length, f"{self.display_name}: free_length [m]")

@@ -27,7 +27,7 @@ class Material(eqx.Module):
     poissons_ratio: Scalar
     density: Scalar
 
-    def __init__(self, youngs_modulus: Number, poissons_ratio: Number, density: Number):
+    def __init__(self, youngs_modulus: Number, poissons_ratio: Number, density: Number) -> None:
         self.youngs_modulus = positive(youngs_modulus, "material: youngs_modulus [Pa]")
         what = "material: poissons_ratio"
         ratio = number(poissons_ratio, (), what)
@@ -73,7 +73,7 @@ class Section(eqx.Module):
         torsional_stiffness: Number | None = None,
         shear_stiffness: Number | Vector | None = None,
         rotary_inertia: Number | Vector | None = None,
-    ):
+    ) -> None:
         self.bending_stiffness = _both(bending_stiffness, "section: bending_stiffness [N m²]")
         self.linear_density = positive(linear_density, "section: linear_density [kg/m]")
         given = lambda entry, check, what: None if entry is None else check(entry, f"section: {what}")

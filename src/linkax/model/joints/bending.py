@@ -110,7 +110,7 @@ class OnBeam(AbstractJoint):
     length: Scalar
     element: int = eqx.field(static=True)
 
-    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, beam: Beam, element: int):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, beam: Beam, element: int) -> None:
         super().__init__(name, parent, child, "x")
         self.beam, self.strains = beam.name, beam.strains
         self.elements, self.element, self.length = beam.elements, element, beam.element_length
@@ -154,7 +154,7 @@ class BeamSegment(OnBeam):
 
     place: Scalar | float
 
-    def __init__(self, name: str, parent: Frame, child: Frame, beam: Beam, element: int, place: Scalar | float):
+    def __init__(self, name: str, parent: Frame, child: Frame, beam: Beam, element: int, place: Scalar | float) -> None:
         super().__init__(name, parent, child, beam, element)
         self.place = place
 
@@ -177,7 +177,7 @@ class SleevePart(OnBeam):
 
     sleeve: str = eqx.field(static=True)
 
-    def __init__(self, name: str, parent: Frame, child: Frame, beam: Beam, element: int, sleeve: str):
+    def __init__(self, name: str, parent: Frame, child: Frame, beam: Beam, element: int, sleeve: str) -> None:
         super().__init__(name, parent, child, beam, element)
         self.sleeve = sleeve
 
@@ -218,7 +218,7 @@ class Sliding(OnBeam):
     `body.at(...)`.
     """
 
-    def __init__(self, name: str, beam: Beam, child: BodyOrFrame):
+    def __init__(self, name: str, beam: Beam, child: BodyOrFrame) -> None:
         if not isinstance(beam, Beam):
             raise ValueError(f"joint {name!r}: beam is {beam!r}; give a lx.Beam, and any body as child")
         super().__init__(name, beam, child, beam, beam.elements - 1)

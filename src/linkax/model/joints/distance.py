@@ -34,7 +34,7 @@ class Distance(AbstractJoint):
 
     rotation = staticmethod(unturned)
 
-    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, length: Number):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, length: Number) -> None:
         super().__init__(name, parent, child, "x")
         remedy = "it must be positive; to join two points, use lx.Spherical"
         self.length = positive(length, f"distance {name!r}: length [m]", remedy)

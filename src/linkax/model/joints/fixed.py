@@ -19,7 +19,7 @@ class Fixed(AbstractJoint):
 
     rotation = staticmethod(unturned)
 
-    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False) -> None:
         super().__init__(name, parent, child, "x", cut=cut)
 
     @staticmethod

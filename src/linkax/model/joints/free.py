@@ -25,7 +25,7 @@ class Free(AbstractJoint):
     aligned_axes = ()
     locked_translations = ()
 
-    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False) -> None:
         super().__init__(name, parent, child, "x", cut=cut)
 
     @staticmethod

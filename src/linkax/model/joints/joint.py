@@ -107,7 +107,7 @@ class AbstractJoint(eqx.Module):
         *,
         second_axis: Axis | None = None,
         cut: bool = False,
-    ):
+    ) -> None:
         """**Arguments:**
 
         - `name`: unique in the mechanism.

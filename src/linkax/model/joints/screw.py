@@ -34,7 +34,7 @@ class Screw(AbstractJoint):
 
     def __init__(
         self, name: str, parent: BodyOrFrame, child: BodyOrFrame, axis: Axis, pitch: Number, *, cut: bool = False
-    ):
+    ) -> None:
         super().__init__(name, parent, child, axis, cut=cut)
         what = f"joint {name!r}: pitch [m/rad]"
         self.pitch = require(number(pitch, (), what), lambda p: p != 0.0, what, "without advance, use lx.Revolute")

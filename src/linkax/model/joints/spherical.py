@@ -23,7 +23,7 @@ class Spherical(AbstractJoint):
     aligned_axes = ()
     locked_translations = (0, 1, 2)
 
-    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False):
+    def __init__(self, name: str, parent: BodyOrFrame, child: BodyOrFrame, *, cut: bool = False) -> None:
         super().__init__(name, parent, child, "x", cut=cut)
 
     @staticmethod
