@@ -26,7 +26,9 @@ from linkax.analysis.steady import (
 from linkax.equations.coordinates import retract
 from linkax.equations.dynamics import generalised_force
 from linkax.equations.loops import is_driven
-from linkax.equations.motion import move
+from linkax.equations.motion import Motion, move
+from linkax.equations.system import System
+from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.model.mechanism import Mechanism
@@ -54,7 +56,7 @@ _STATICS = TangentSpace(metric="identity")
 class EquilibriumError(RuntimeError):
     """No equilibrium was found; `state` is where the search stopped."""
 
-    def __init__(self, message: str, state: State | None = None):  # pickle calls it with the message alone
+    def __init__(self, message: str, state: State | None = None) -> None:  # pickle calls it with the message alone
         super().__init__(message)
         self.state = state
 
@@ -67,18 +69,18 @@ class _Balanced(Nearby):
     """A mechanism near an equilibrium: its forces, centrifugal ones included, on a T orthonormal in the scales."""
 
     @staticmethod
-    def of(system, method, t, q) -> "_Balanced":
+    def of(system: System, method: TangentSpace, t: Float[Array, ""], q: Float[Array, " n_q"]) -> "_Balanced":
         basis = lax.stop_gradient(method.constraint_split(system, t, q).inverse.basis)
         return _Balanced(system, method, t, q, basis, basis.T / system.scales**2)
 
-    def motion(self, y):
+    def motion(self, y: Float[Array, " n_v"]) -> tuple[Motion, ConstraintSplit]:
         """The motion at y, v as drives ask and else as small as the loops allow, and the constraints there."""
         zero = jnp.zeros_like(self.system.scales)
         q, v, *_ = self.method.correct(self.system, self.t, self.at(y), zero)
         crossing = self.method.constraint_split(self.system, self.t, q)
         return move(crossing.configuration, v if is_driven(self.system) else zero), crossing
 
-    def force(self, y):
+    def force(self, y: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
         """Forces along y, less the reactions of the loops."""
         motion, crossing = self.motion(y)
         forces, none = generalised_force(motion), jnp.zeros(len(crossing.jacobian), y.dtype)
@@ -86,7 +88,7 @@ class _Balanced(Nearby):
         left, _ = constrained_solve(crossing.inverse, metric, crossing.jacobian, forces, none)
         return self.dual @ left
 
-    def force_and_stiffness(self):
+    def force_and_stiffness(self) -> tuple[Float[Array, " n_v"], Float[Array, "n_v n_v"]]:
         """The force f at y = 0, and the stiffness −∂f/∂y."""
         force, slopes = self.slopes(self.force, jnp.zeros_like(self.system.scales))
         return force, -slopes
@@ -110,7 +112,7 @@ class _Ending(NamedTuple):
     changes: Float[Array, ""]
 
     @property
-    def is_sound(self):
+    def is_sound(self) -> Bool[Array, ""]:
         """Whether the search ended in an equilibrium."""
         steady = (jnp.max(self.missed, initial=0.0) <= AGREES) & (self.changes <= AGREES)
         return (self.longest <= BALANCED_STEP) & (self.gap <= CLOSED) & jnp.logical_not(self.unstable) & steady

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Bool, Float
 
 from linkax.analysis.linearisation import Linearisation, gyroscopic_frequencies, state_matrix
 from linkax.analysis.steady import (
@@ -26,7 +26,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.coordinates import carried, retract
 from linkax.equations.loops import jacobian
 from linkax.equations.motion import move
-from linkax.equations.system import system_of
+from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
@@ -55,7 +55,9 @@ class _Moving(Nearby):
     v: Float[Array, " n_v"]
 
     @staticmethod
-    def of(system, method, t, q, v) -> "_Moving":
+    def of(
+        system: System, method: TangentSpace, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    ) -> "_Moving":
         departure = method.at_rest(system, t, q)
         crossing, mass = departure.split, departure.mass
         fixed = crossing.inverse.basis
@@ -69,14 +71,14 @@ class _Moving(Nearby):
         basis = basis @ cholesky_inverse_by_elimination(basis.T @ mass @ basis + empty)[0].T
         return _Moving(system, method, t, q, basis, basis.T @ mass, v)
 
-    def after(self, t, motion) -> "_Moving":
+    def after(self, t: Float[Array, ""], motion: Float[Array, " n_v"]) -> "_Moving":
         """The same mechanism at time t, displaced by `motion`, with T carried along."""
         carry = lambda change: carried(self.system.topology, motion, change)
         basis, dual = jax.vmap(carry, in_axes=1, out_axes=1)(self.basis), jax.vmap(carry)(self.dual)
         q = retract(self.system.topology, self.q, motion)
         return dataclasses.replace(self, t=t, q=q, basis=basis, dual=dual)
 
-    def acceleration(self, y, y_rate):
+    def acceleration(self, y: Float[Array, " n_v"], y_rate: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
         """ÿ, in coordinates y that move with the steady motion: q(t) ⊕ T y."""
         along = self.basis @ y_rate
         _, acceleration, *_ = self.method.derivative(self.system, self.t, self.at(y), self.v + along, True)
@@ -86,14 +88,14 @@ class _Moving(Nearby):
             acceleration = acceleration - jax.jvp(carry, (nothing,), (nothing + 1.0,))[1]
         return self.dual @ acceleration
 
-    def coefficients(self):
+    def coefficients(self) -> tuple[Float[Array, " n_v"] | Float[Array, "n_v n_v"], ...]:
         """ÿ at y = ẏ = 0, the stiffness −∂ÿ/∂y and the damping −∂ÿ/∂ẏ."""
         origin = jnp.zeros_like(self.system.scales)
         of_both = lambda both: self.acceleration(*jnp.split(both, 2))
         acceleration, slopes = self.slopes(of_both, jnp.concatenate([origin, origin]))
         return acceleration, *jnp.split(-slopes, 2, axis=1)
 
-    def opens(self):
+    def opens(self) -> Float[Array, ""]:
         """The largest gap of the loops, rate that speeds miss, or slope at which T opens the loops."""
         slopes = jacobian(configure(self.system, self.t, self.q)) @ self.basis
         longest = largest(self.basis / self.system.scales[:, None])
@@ -117,7 +119,7 @@ class _Steadiness(NamedTuple):
     changes: Float[Array, ""]
 
     @property
-    def is_steady(self):
+    def is_steady(self) -> Bool[Array, ""]:
         """Whether all of them are negligible."""
         return (jnp.max(self.missed, initial=0.0) <= AGREES) & (self.off <= NEAR) & (self.changes <= CONSTANT)
 
@@ -263,7 +265,9 @@ class _Modes(NamedTuple):
     square: Float[Array, " d"]
 
     @staticmethod
-    def of(system, basis, stiffness, v) -> "_Modes":
+    def of(
+        system: System, basis: Float[Array, "n_v d"], stiffness: Float[Array, "d d"], v: Float[Array, " n_v"]
+    ) -> "_Modes":
         values, vectors = eigh(stiffness)
         return _Modes(basis @ vectors, vectors, jnp.maximum(jnp.abs(values), system.fastest(v) ** 2))
 
