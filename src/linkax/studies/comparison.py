@@ -111,7 +111,9 @@ class _Motion(NamedTuple):
     points: Mapping[str, tuple[str, str | None]]
     times: np.ndarray
 
-    def run(self, formulation, stepping, part=1.0, throw=False) -> Solution:
+    def run(
+        self, formulation: AbstractFormulation | None, stepping: Stepping, part: float = 1.0, throw: bool = False
+    ) -> Solution:
         """Integrate the first `part` of the time."""
         times, t1 = part * self.times, float(self.times[-1])
         solution = simulate(
@@ -127,7 +129,7 @@ class _Motion(NamedTuple):
         )
         return jax.block_until_ready(solution)
 
-    def positions(self, solution) -> dict[str, np.ndarray]:
+    def positions(self, solution: Solution) -> dict[str, np.ndarray]:
         """{name of a point: positions, (n_t, 3) [m]}."""
         return {name: np.asarray(solution.position(*point)) for name, point in self.points.items()}
 

@@ -209,7 +209,9 @@ class _Checkpoint(NamedTuple):
     identity: str
 
     @staticmethod
-    def of(path, search, z, state, args) -> "_Checkpoint":
+    def of(
+        path: str | os.PathLike, search: AbstractSearch, z: Float[Array, " p"], state: Any, args: tuple
+    ) -> "_Checkpoint":
         path = Path(require_type(path, str | os.PathLike, "checkpoint", "give the name of a file"))
         writable_folder(path.parent, f"give another checkpoint than {str(path)!r}")
         if path.is_dir():
@@ -218,7 +220,7 @@ class _Checkpoint(NamedTuple):
         numbers = jax.tree.leaves(eqx.filter((search, z, args), eqx.is_array))
         return _Checkpoint(path, search.free.names, fingerprint(text, numbers))
 
-    def save(self, tree, losses, waited):
+    def save(self, tree: Any, losses: list[float], waited: int) -> None:
         """Write the arrays of `tree`, the losses, and the number of steps that gained nothing."""
         header = json.dumps({"names": self.names, "fit": self.identity, "losses": losses, "waited": waited})
         leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array))
@@ -226,7 +228,7 @@ class _Checkpoint(NamedTuple):
         with written_whole(self.path) as file, open(file, "wb") as stream:
             np.savez(stream, header=np.array(header), **arrays)
 
-    def load(self, like):
+    def load(self, like: Any) -> tuple[Any, list[float], int]:
         """Read what `save` wrote; `like` is a tree of the same structure.
 
         **Raises:** `ValueError` for a file of something else.

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from linkax.studies.uncertainty import NO_INFLUENCE
 
@@ -15,6 +15,10 @@ HIGHER, LOWER = 2.0, 5.0
 ENOUGH = 0.25  # gain of a step, relative to the predicted one, above which the next is damped less
 NOTHING = 1e-2  # gain that is not worth a step, relative to rtol
 
+# The states of `_ScaledDescent` and `_DelayedDamping`.
+DescentState = tuple[Float[Array, "k p"], Float[Array, " k"], Float[Array, " k"], Float[Array, " p"]]
+SearchState = tuple[Float[Array, ""], Bool[Array, ""]]
+
 
 class _ScaledDescent(optx.AbstractDescent):
     """Steps −(Jᵀ J + λ D²)⁻¹ Jᵀ r, with λ one over the step size, D the largest norms so far of the columns of J.
@@ -23,11 +27,11 @@ class _ScaledDescent(optx.AbstractDescent):
     others. (Moré, The Levenberg-Marquardt algorithm, 1978, section 6, says why D must not fall.)
     """
 
-    def init(self, y, f_info_struct):
+    def init(self, y: Float[Array, " p"], f_info_struct: Any) -> DescentState:
         none = jnp.zeros(min(len(y), f_info_struct.residual.shape[0]), y.dtype)
         return jnp.outer(none, y), none, none, jnp.zeros_like(y)
 
-    def query(self, y, f_info, state):
+    def query(self, y: Float[Array, " p"], f_info: Any, state: DescentState) -> DescentState:
         slopes = f_info.jac.as_matrix()
         largest = jnp.maximum(state[-1], jnp.linalg.norm(slopes, axis=0))
         # Parameters without influence, whose slopes are rounding, stay as they are.
@@ -36,7 +40,7 @@ class _ScaledDescent(optx.AbstractDescent):
         left, values, right = jnp.linalg.svd(jnp.where(matters, slopes / sizes, 0.0), full_matrices=False)
         return right / sizes, left.T @ f_info.residual, values, largest
 
-    def step(self, step_size, state):
+    def step(self, step_size: Float[Array, ""], state: DescentState) -> tuple[Float[Array, " p"], optx.RESULTS]:
         right, residual, values, _ = state
         return -right.T @ (residual * values / (values**2 + 1.0 / step_size)), optx.RESULTS.successful
 
@@ -52,10 +56,18 @@ class _DelayedDamping(optx.AbstractSearch):
 
     rtol: int | float
 
-    def init(self, y, f_info_struct):
+    def init(self, y: Float[Array, " p"], f_info_struct: Any) -> SearchState:
         return jnp.asarray(FIRST_DAMPING, y.dtype), jnp.zeros((), bool)
 
-    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+    def step(
+        self,
+        first_step: Bool[Array, ""],
+        y: Float[Array, " p"],
+        y_eval: Float[Array, " p"],
+        f_info: Any,
+        f_eval_info: Any,
+        state: SearchState,
+    ) -> tuple[Float[Array, ""], Bool[Array, ""], optx.RESULTS, SearchState]:
         damping, _ = state
         before, after = f_info.as_min(), f_eval_info.as_min()
         expected = -optx.ClassicalTrustRegion().predict_reduction(y_eval - y, f_info)
@@ -84,7 +96,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     search: optx.AbstractSearch
     verbose: Callable
 
-    def __init__(self, rtol: int | float, atol: int | float):
+    def __init__(self, rtol: int | float, atol: int | float) -> None:
         self.rtol, self.atol = rtol, atol
         self.norm, self.verbose = optx.max_norm, _silent
         self.descent, self.search = _ScaledDescent(), _DelayedDamping(rtol)

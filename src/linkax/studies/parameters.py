@@ -40,7 +40,7 @@ class Positive(AbstractParameter):
 
     value: Float[Array, "..."]
 
-    def __init__(self, value: ArrayLike | Sequence):
+    def __init__(self, value: ArrayLike | Sequence) -> None:
         self.value = _checked("Positive", value, lambda value: value > 0.0, "must be positive")
 
     @property
@@ -63,7 +63,7 @@ class Bounded(AbstractParameter):
     lower: Float[Array, ""]
     upper: Float[Array, ""]
 
-    def __init__(self, value: ArrayLike | Sequence, lower: ArrayLike, upper: ArrayLike):
+    def __init__(self, value: ArrayLike | Sequence, lower: ArrayLike, upper: ArrayLike) -> None:
         self.lower, self.upper = (number(bound, (), "Bounded: bound") for bound in (lower, upper))
         inside = lambda value: (value > self.lower) & (value < self.upper)
         self.value = _checked("Bounded", value, inside, f"must lie between {lower} and {upper}")
@@ -107,7 +107,7 @@ class PhysicalInertia(AbstractParameter):
         mass: ArrayLike,
         center_of_mass: ArrayLike | Sequence = (0.0, 0.0, 0.0),
         inertia: ArrayLike | Sequence = (1.0, 1.0, 1.0),
-    ):
+    ) -> None:
         m = number(mass, (), "PhysicalInertia: mass [kg]")
         center = number(center_of_mass, (3,), "PhysicalInertia: center_of_mass [m]")
         matrix: Any = inertia
