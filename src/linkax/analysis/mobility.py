@@ -107,8 +107,8 @@ def mobility(
 def _mobility(mechanism, state, t, tangent_space):
     system, topology = system_of(mechanism, state.q.dtype, fixed_scales=False), mechanism.topology
     tolerance = tangent_space.prepared(system.dtype).rank_tolerance
-    crossing = ConstraintSplit.at(system, t, state.q, tolerance)
-    rank, rows = jnp.sum(crossing.inverse.rank), crossing.jacobian
+    split = ConstraintSplit.at(system, t, state.q, tolerance)
+    rank, rows = jnp.sum(split.inverse.rank), split.jacobian
     dispensable = jnp.zeros(0, bool)
     if topology.num_rows:
         free = least_multipliers(rows, rows[:, 0], system.scales, tolerance, rank).free

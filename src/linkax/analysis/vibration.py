@@ -59,12 +59,12 @@ class _Moving(Nearby):
         system: System, method: TangentSpace, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
     ) -> "_Moving":
         departure = method.at_rest(system, t, q)
-        crossing, mass = departure.split, departure.mass
-        fixed = crossing.inverse.basis
-        still = jnp.zeros(len(crossing.jacobian), mass.dtype)
+        split, mass = departure.split, departure.mass
+        fixed = split.inverse.basis
+        still = jnp.zeros(len(split.jacobian), mass.dtype)
 
         def tangent(column):
-            return constrained_solve(crossing.inverse, mass, crossing.jacobian, mass @ column, still)[0]
+            return constrained_solve(split.inverse, mass, split.jacobian, mass @ column, still)[0]
 
         basis = jax.vmap(tangent, in_axes=1, out_axes=1)(fixed)
         empty = jnp.diag((jnp.sum(fixed**2, axis=0) == 0.0).astype(mass.dtype))

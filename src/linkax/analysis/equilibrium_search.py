@@ -1,0 +1,147 @@
+"""Search downhill for an equilibrium, on the tangent space of the loops."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Float, Int
+
+from linkax.analysis.steady import Nearby, eigh
+from linkax.equations.coordinates import retract
+from linkax.equations.dynamics import generalised_force
+from linkax.equations.loops import is_driven
+from linkax.equations.motion import Motion, move
+from linkax.equations.system import System
+from linkax.formulations.constraint_split import ConstraintSplit
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.linalg.constrained_solve import constrained_solve
+from linkax.simulation.start.closing import LONGEST_STEP
+from linkax.xla.arrays import Array
+from linkax.xla.batches import one_by_one
+from linkax.xla.derivatives import pushforward
+
+MOST_STEPS = 200
+SMALLEST_STEP = 1e-12  # at which the search ends [rad, lengths of the mechanism]
+OVERSHOOT = 0.5  # work of the forces at the end of a step, against it, relative to their work at its start
+NEUTRAL = 1e-12  # stiffness, relative to the largest, up to which it counts as zero
+ASIDE = 1e-3  # first step out of an unstable equilibrium [rad, lengths of the mechanism]; each next one doubles it
+
+_pseudo_inverse = one_by_one(lambda matrix: jnp.linalg.pinv(matrix, rtol=NEUTRAL))
+
+# An equilibrium needs no mass, and forces differ less between soft and stiff directions than accelerations do.
+STATICS = TangentSpace(metric="identity")
+
+
+class Balanced(Nearby):
+    """A mechanism near an equilibrium: its forces, centrifugal ones included, on a T orthonormal in the scales."""
+
+    @staticmethod
+    def of(system: System, method: TangentSpace, t: Float[Array, ""], q: Float[Array, " n_q"]) -> "Balanced":
+        basis = lax.stop_gradient(method.constraint_split(system, t, q).inverse.basis)
+        return Balanced(system, method, t, q, basis, basis.T / system.scales**2)
+
+    def motion(self, y: Float[Array, " n_v"]) -> tuple[Motion, ConstraintSplit]:
+        """The motion at y, v as drives ask and else as small as the loops allow, and the constraints there."""
+        zero = jnp.zeros_like(self.system.scales)
+        q, v, *_ = self.method.correct(self.system, self.t, self.at(y), zero)
+        split = self.method.constraint_split(self.system, self.t, q)
+        return move(split.configuration, v if is_driven(self.system) else zero), split
+
+    def force(self, y: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
+        """Forces along y, less the reactions of the loops."""
+        motion, split = self.motion(y)
+        forces, none = generalised_force(motion), jnp.zeros(len(split.jacobian), y.dtype)
+        metric = jnp.diag(self.system.scales**-2)
+        left, _ = constrained_solve(split.inverse, metric, split.jacobian, forces, none)
+        return self.dual @ left
+
+    def force_and_stiffness(self) -> tuple[Float[Array, " n_v"], Float[Array, "n_v n_v"]]:
+        """The force f at y = 0, and the stiffness −∂f/∂y."""
+        force, slopes = self.slopes(self.force, jnp.zeros_like(self.system.scales))
+        return force, -slopes
+
+
+class Search(NamedTuple):
+    """A search for an equilibrium.
+
+    - `steps`: number of steps tried.
+    - `q`: coordinates reached. `step`: change of them to try next, (n_v,); `longest`: its largest part [rad, lengths of
+      the mechanism]; `work`: of the forces on it [J].
+    - `lowest`: smallest stiffness in any direction, zero where none is negative.
+    - `circulation`: largest entry of the skew part of the stiffness, which has no potential.
+    """
+
+    steps: Int[Array, ""]
+    q: Float[Array, " n_q"]
+    step: Float[Array, " n_v"]
+    longest: Float[Array, ""]
+    work: Float[Array, ""]
+    lowest: Float[Array, ""]
+    circulation: Float[Array, ""]
+
+
+@eqx.filter_custom_jvp
+def search_downhill(
+    system: System, t: Float[Array, ""], q: Float[Array, " n_q"]
+) -> tuple[Float[Array, " n_q"], Search]:
+    """Coordinates of an equilibrium, and the last `Search`, from coordinates q."""
+    method, zero = STATICS.prepared(system.dtype), jnp.zeros(system.topology.num_speeds, system.dtype)
+    size = system.fastest
+
+    def unfinished(search):
+        return (search.steps < MOST_STEPS) & (search.longest > SMALLEST_STEP)
+
+    def advance(search):
+        """Try a step. If it goes beyond the minimum of the potential, halve it, else choose the next one from there.
+
+        A step is f / |k| along each eigenvector of the stiffness. At an equilibrium that is unstable it is one along
+        the least stable direction.
+        """
+        q, _ = method.close(system, t, retract(system.topology, search.q, search.step), zero)
+        here = Balanced.of(system, method, t, q)
+        force, stiffness = here.force_and_stiffness()
+        values, vectors = eigh((stiffness + stiffness.T) / 2.0)
+        stiff = jnp.abs(values) > NEUTRAL * jnp.max(jnp.abs(values))
+        along = vectors.T @ force
+        downhill = vectors @ jnp.where(stiff, along / jnp.where(stiff, jnp.abs(values), 1.0), along)
+        step = here.basis @ downhill
+        shorter = jnp.minimum(1.0, LONGEST_STEP / jnp.where(size(step) > 0.0, size(step), 1.0))
+        lowest = jnp.where(stiff[0], jnp.minimum(values[0], 0.0), 0.0)
+        circulation = jnp.max(jnp.abs(stiffness - stiffness.T)) / 2.0
+        aside = here.basis @ vectors[:, 0]
+        # The sign of an eigenvector is arbitrary: let its largest part be positive.
+        aside = aside * jnp.sign(aside[jnp.argmax(jnp.abs(aside / system.scales))])
+        leave = (size(step) <= SMALLEST_STEP) & (lowest < 0.0) & (circulation <= -lowest)
+        step, work = jnp.where(leave, ASIDE * aside / size(aside), shorter * step), shorter * (downhill @ force)
+        onwards = Search(search.steps + 1, q, step, size(step), jnp.where(leave, 0.0, work), lowest, circulation)
+        half = search._replace(
+            steps=search.steps + 1, step=search.step / 2.0, longest=search.longest / 2.0, work=search.work / 2.0
+        )
+        beyond = (here.dual @ search.step) @ force < -OVERSHOOT * search.work
+        return jax.tree.map(lambda a, b: jnp.where(beyond, a, b), half, onwards)
+
+    nothing = jnp.zeros((), system.dtype)
+    begin = Search(jnp.zeros((), int), q, zero, nothing + jnp.inf, *3 * (nothing,))
+    search = lax.while_loop(unfinished, advance, begin)
+    return search.q, search
+
+
+@search_downhill.def_jvp
+def _jvp(primals, changes):
+    """Derivatives, to any order, of the coordinates at which the forces balance; those of the search do not matter."""
+    (system, t, begin), (system_change, t_change, _) = primals, changes
+    q, search = search_downhill(system, t, begin)
+    here = Balanced.of(system, STATICS.prepared(system.dtype), t, q)
+    zero = jnp.zeros(system.topology.num_speeds, system.dtype)
+    force = lambda system, t: dataclasses.replace(here, system=system, t=t).force(zero)
+    _, unbalanced = pushforward(force, (system, t), (system_change, t_change))
+    change = _pseudo_inverse(here.force_and_stiffness()[1]) @ unbalanced
+
+    def moved(system, t, y):
+        return here.method.close(system, t, retract(system.topology, q, here.basis @ y), zero)[0]
+
+    _, q_change = pushforward(moved, (system, t, zero), (system_change, t_change, change))
+    return (q, search), (q_change, jax.tree.map(lambda _: None, search))
