@@ -1,15 +1,19 @@
 """Functions with another way of computing in a batch, where JAX's own rules cost too much or hang."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from linkax.xla.arrays import Array
+
 SMALL = 32  # rows, up to which elimination serves batches
 
 
-def one_by_one(function):
+def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
     """Map a function that calls LAPACK over the members of a batch one after another, on a CPU.
 
     jaxlib (0.10) spreads a LAPACK call for a batch over the threads that the program itself runs in, and waits for
@@ -33,7 +37,7 @@ def one_by_one(function):
     return differentiable
 
 
-def small_in_batches(single, batched):
+def small_in_batches(single: Callable[[Array], Any], batched: Callable[[Array], Any]) -> Callable[[Array], Any]:
     """Compute a function of a matrix by `batched` in batches of small matrices, by `single` elsewhere."""
 
     @jax.custom_batching.custom_vmap

@@ -1,12 +1,16 @@
 """The vector product as an operation of its own for JAX."""
 
+import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Float
+
+from linkax.xla.arrays import Array
 
 
-def cross(a, b):
+def cross(a: Float[Array, "*#batch 3"], b: Float[Array, "*#batch 3"]) -> Float[jax.Array, "*batch 3"]:
     """Vector product along the last axis, shape (..., 3).
 
     It is an operation of its own for JAX, so that derivatives of vector products are vector products. Those of their

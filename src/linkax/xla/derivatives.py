@@ -1,31 +1,40 @@
 """Derivatives as linkax needs them: None for zero, whole Jacobians, quotients without NaN."""
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from linkax.xla.arrays import Array
+
+Found = TypeVar("Found")
 
 
-def ratio(a, b, otherwise):
+def ratio(
+    a: Float[Array, "*#shape"] | float, b: Float[Array, "*#shape"], otherwise: Float[Array, "*#shape"] | float
+) -> Float[jax.Array, "*shape"]:
     """a / b where b > 0, elsewhere another value; its derivatives hold no NaN of the branch not taken."""
     return jnp.where(b > 0.0, a / jnp.where(b > 0.0, b, 1.0), otherwise)
 
 
-def materialise(primal, change):
+def materialise(primal: Array | float, change: Array | None) -> Array:
     """Return a tangent as an array; None, the tangent of what does not change, as zeros."""
     return jnp.zeros_like(primal) if change is None else change
 
 
-def pushforward(function, primals, changes):
+def pushforward(function: Callable[..., Found], primals: tuple, changes: tuple) -> tuple[Found, Any]:
     """Compute a function and its JVP, like `equinox.filter_jvp`, but with zeros where that gives None."""
     found, change = eqx.filter_jvp(function, primals, changes)
     numbers, _ = eqx.partition(found, eqx.is_inexact_array)
     return found, jax.tree.map(materialise, numbers, change)
 
 
-def whole_jacobian(function):
+def whole_jacobian(function: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a function (static, *arrays) of few numbers: compute its Jacobian once, and contract it with each
     tangent.
 

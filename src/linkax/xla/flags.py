@@ -31,7 +31,7 @@ QUICK = {  # to compile, not to run
 }
 
 
-def set_flags():
+def set_flags() -> None:
     """Add to the environment's `XLA_FLAGS` the flags that it does not name yet."""
     given, flags = os.environ.get("XLA_FLAGS", ""), [LOOPS]
     if jaxlib.__version__.startswith(KNOWN_VERSIONS):
@@ -41,7 +41,7 @@ def set_flags():
 
 
 @cache
-def quickest_to_compile() -> dict:
+def quickest_to_compile() -> dict[str, int | bool]:
     """Options of `jax.jit`, as far as XLA knows them: less than half of the time to compile, a slower program."""
     return {name: value for name, value in QUICK.items() if _is_known({name: value})}
 

@@ -6,6 +6,7 @@ Each program holds memory maps, of which Linux gives a process 65 530. Where XLA
 import gc
 import warnings
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,12 +16,12 @@ ROOM = 10_000  # memory maps; the largest programs of linkax take 4000
 MAPS, LIMIT_OF_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 
 
-def watch_memory_maps():
+def watch_memory_maps() -> None:
     """Have `make_room` called before each compilation in this process."""
     jax.monitoring.register_scalar_listener(make_room)
 
 
-def make_room(event, *_time, **_what):
+def make_room(event: str, *_time: Any, **_what: Any) -> None:
     """Clear JAX's caches where too few memory maps are left for another program.
 
     **Raises:** `RuntimeError` where other things hold the maps. XLA would end the process.

@@ -1,18 +1,26 @@
 """A computation as one kernel of the CPU, or as a branch that XLA does not inline."""
 
+from collections.abc import Callable
 from functools import wraps
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Bool, Float
 
+from linkax.xla.arrays import Array
 from linkax.xla.flags import makes_kernels_of_loops
 from linkax.xla.products_as_sums import with_products_as_sums
 from linkax.xla.tracing import jit_inline
 
+Found = TypeVar("Found")
 
-def in_one_kernel(when, sound):
+
+def in_one_kernel(
+    when: Callable[..., bool], sound: Callable[..., Bool[Array, ""]]
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorate a function: where `when(*args)`, compute it as one kernel of the CPU, if XLA makes such kernels.
 
     XLA starts each operation of a program by itself, which takes longer than one on few numbers runs. A loop it
@@ -70,7 +78,7 @@ def _undefined(shape):
     return jnp.full(shape.shape, jnp.nan if jnp.issubdtype(shape.dtype, jnp.inexact) else 0, shape.dtype)
 
 
-def where_finite(function, array, otherwise):
+def where_finite(function: Callable[[Array], Found], array: Float[Array, "..."], otherwise: Found) -> Found:
     """Compute function(array) as a branch of its own where the array is finite; elsewhere return `otherwise`.
 
     The branch is for speed: XLA runs a computation on the CPU without the cost of scheduling its parts (half of the

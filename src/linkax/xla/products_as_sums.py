@@ -1,7 +1,9 @@
 """Products of small matrices as sums of products of numbers, which a kernel can hold."""
 
 import math
+from collections.abc import Callable
 from functools import cache, wraps
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +13,12 @@ from jax.extend.core.primitives import dot_general_p
 
 from linkax.xla.flags import makes_kernels_of_loops
 
+Found = TypeVar("Found")
+
 FEW_MULTIPLICATIONS = 2**12  # which take no longer as a sum than a library takes
 
 
-def with_products_as_sums(function):
+def with_products_as_sums(function: Callable[..., Found]) -> Callable[..., Found]:
     """Decorate a function of arrays: replace its products of small matrices by sums, where loops are kernels.
 
     XLA leaves products of matrices on a CPU to a library, which the kernel of a loop cannot call (jaxlib 0.12).

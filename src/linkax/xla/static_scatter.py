@@ -6,9 +6,14 @@ and cannot be part of a larger kernel there (see `linkax.xla.flags`).
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
+
+from linkax.xla.arrays import Array
 
 
-def scatter_static(onto, places, values):
+def scatter_static(
+    onto: Float[Array, "*shape"], places: Int[np.ndarray, "..."] | tuple[int, ...], values: Float[Array, "..."]
+) -> Float[Array, "*shape"]:
     """Write values to indices along the first axis of `onto`, (n, …); indices and values need not be flat."""
     places = np.ravel(places)
     if not len(places):

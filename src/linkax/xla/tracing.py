@@ -6,24 +6,29 @@ where there are loops. Of a function marked `jit_inline` JAX keeps what it has t
 compiles it in place, so that it runs as fast as without the mark.
 """
 
+from collections.abc import Callable
 from functools import cache, partial, wraps
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer, eval_context
+from jaxtyping import PyTree
 
 from linkax.xla.flags import quickest_to_compile
+
+Found = TypeVar("Found")
 
 jit_inline = eqx.filter_jit
 
 
-def concrete(number) -> np.ndarray | None:
+def concrete(number: Any) -> np.ndarray | None:
     """Return a number as a NumPy array, or None while a transformation traces it."""
     return None if isinstance(number, Tracer) else np.asarray(number)
 
 
-def all_concrete(tree) -> bool:
+def all_concrete(tree: PyTree) -> bool:
     """Whether no array in a tree is traced by a transformation."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
@@ -31,14 +36,14 @@ def all_concrete(tree) -> bool:
 class Program:
     """A function as a program of its own: optimised, or for one run compiled in less than half of the time."""
 
-    def __init__(self, function):
+    def __init__(self, function: Callable[..., Any]) -> None:
         self.optimised = jit_inline(function)
         # XLA is asked for its options when the program runs.
         self._quick = cache(
             lambda: eqx.filter_jit(function, compiler_options=quickest_to_compile())  # pyright: ignore[reportCallIssue]
         )
 
-    def choose(self, quick: bool, *args):
+    def choose(self, quick: bool, *args: Any) -> Callable[..., Any]:
         """Choose what to call with these arguments: the quick program for concrete ones only, if asked for.
 
         Inside of a transformation that one is compiled by itself all the same.
@@ -46,13 +51,13 @@ class Program:
         return partial(evaluate_now, self._quick()) if quick and all_concrete(args) else self.optimised
 
 
-def quick_compile(function):
+def quick_compile(function: Callable[..., Found]) -> Callable[..., Found]:
     """Decorate a function that seldom runs more than once on the same kind of arguments, see `Program`."""
     program = Program(function)
     return wraps(function)(lambda *args: program.choose(True, *args)(*args))
 
 
-def evaluate_now(function, *args):
+def evaluate_now(function: Callable[..., Found], *args: Any) -> Found:
     """Compute function(*args) of concrete arguments at once, also while a transformation is tracing."""
     # Not `jax.ensure_compile_time_eval`: with it JAX compiles each operation on constants by itself.
     with eval_context():

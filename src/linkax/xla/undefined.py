@@ -8,13 +8,15 @@ import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Bool, PyTree
 
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise
 from linkax.xla.primitives import primitive
 
 
 @eqx.filter_custom_jvp
-def undefined_where(undefined, values, inputs):
+def undefined_where(undefined: PyTree[Bool[Array, "..."]], values: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
     """Return `values` as they are, with undefined derivatives by `inputs` where `undefined`.
 
     Forwards these are NaN. Backwards so are the cotangents of all inputs, unless the value has no cotangent: what a
