@@ -99,7 +99,7 @@ def _inverse_dynamics(mechanism, state, wanted, t):
     along = jax.jacfwd(lambda v: speeds(q, v))(v)
     rows = jnp.concatenate([loops, along])
     right = jnp.concatenate([gamma(motion), jnp.concatenate(wanted.values) - turning])
-    tolerance = TangentSpace().prepared(system.dtype).rank_tolerance
+    tolerance = TangentSpace().prepared(system.dtype).tolerance
     inverse = invert(mass, rows, system.scales, tolerance)
     acceleration, multipliers = constrained_solve(inverse, mass, rows, generalised_force(motion), right)
     multipliers = least_multipliers(rows, multipliers, system.scales, tolerance, inverse.rank).multipliers

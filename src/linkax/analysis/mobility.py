@@ -106,7 +106,7 @@ def mobility(
 @quick_compile
 def _mobility(mechanism, state, t, tangent_space):
     system, topology = system_of(mechanism, state.q.dtype, fixed_scales=False), mechanism.topology
-    tolerance = tangent_space.prepared(system.dtype).rank_tolerance
+    tolerance = tangent_space.prepared(system.dtype).tolerance
     split = ConstraintSplit.at(system, t, state.q, tolerance)
     rank, rows = jnp.sum(split.inverse.rank), split.jacobian
     dispensable = jnp.zeros(0, bool)

@@ -22,7 +22,7 @@ from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.static_sparse import StaticSparse, constant_product
 from linkax.linalg.triangular import cholesky_inverse, upper_inverse
 from linkax.spatial.vectors import length
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
 
 
@@ -59,7 +59,7 @@ class BlockInverse(eqx.Module):
     distance: Float[Array, ""]
     definiteness: Float[Array, ""]
 
-    def apply(self, f, gamma):
+    def apply(self, f: Float[Array, " n"], gamma: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """Solve for (a, λ)."""
         plan, kept = self.plan, self.last.shape[0]
         added = plan.interior_table.shape[1]
@@ -85,7 +85,13 @@ class BlockInverse(eqx.Module):
         return a, _gathered(found[:, added:], plan.row_table, gamma.shape[0])
 
 
-def invert_by_blocks(blocks: Blocks, scales, tolerance, plan: EliminationPlan, rank_nearby=None) -> BlockInverse:
+def invert_by_blocks(
+    blocks: Blocks,
+    scales: Float[Array, " n"],
+    tolerance: Scalar | float,
+    plan: EliminationPlan,
+    rank_nearby: Int[Array, " k"] | None = None,
+) -> BlockInverse:
     """Invert like `linkax.linalg.constrained_solve.invert`, front by front; `rank_nearby` of each front, (k,)."""
     blocks, scales = lax.stop_gradient((blocks, scales))
     kept_unit, added_unit = (_read(scales, table) for table in (plan.separator_table, plan.interior_table))
@@ -123,7 +129,7 @@ def in_fronts(plan: EliminationPlan, weight: StaticSparse, jacobian: StaticSpars
     )
 
 
-def with_identity_metric(blocks: Blocks, plan: EliminationPlan, scales) -> Blocks:
+def with_identity_metric(blocks: Blocks, plan: EliminationPlan, scales: Float[Array, " n"]) -> Blocks:
     """Replace M by the identity metric, which measures speeds in their scales."""
     own = jax.vmap(jnp.diag)(jnp.where(plan.interior_table < 0, 0.0, _read(scales, plan.interior_table) ** -2))
     return Blocks(blocks.rows, jnp.zeros_like(blocks.coupling), own)
@@ -136,7 +142,7 @@ class SaddlePointInFronts(eqx.Module):
     plan: EliminationPlan = eqx.field(static=True)
     sizes: tuple[int, int] = eqx.field(static=True)
 
-    def __call__(self, unknowns):
+    def __call__(self, unknowns: Float[Array, " k"]) -> Float[Array, " k"]:
         blocks, (table, rows), (n, m) = self.blocks, (self.plan.table, self.plan.row_table), self.sizes
         coupled = jnp.pad(blocks.coupling, ((0, 0), (0, 0), (blocks.coupling.shape[1], 0)))
         own = jnp.concatenate([jnp.swapaxes(blocks.coupling, 1, 2), blocks.own], axis=2)
@@ -168,10 +174,12 @@ class _Here(NamedTuple):
 
     kept: int
     size: Float[Array, ""]
-    tolerance: Float[Array, ""]
+    tolerance: Scalar | float
     is_known: bool
 
-    def eliminate(self, passed: _Passed, front):
+    def eliminate(
+        self, passed: _Passed, front: tuple[Blocks, Float[Array, "s width"], Int[Array, ""]]
+    ) -> tuple[_Passed, _Eliminated]:
         """Eliminate one front: y are the directions passed on and the interior speeds."""
         blocks, onward, rank = front
         kept, (rows, width) = self.kept, blocks.rows.shape

@@ -6,22 +6,34 @@ four blocks of the saddle-point system's inverse, a = T f + G γ, λ = S γ − 
 alike.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.static_sparse import assembled
 from linkax.linalg.triangular import cholesky_inverse, cholesky_inverse_by_elimination, upper_inverse
 from linkax.spatial.vectors import length
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import jit_inline
+
+Islands = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of each
+
+
+@runtime_checkable
+class Inverse(Protocol):
+    """The inverse of [[M, −Jᵀ], [J, 0]]: `SaddleInverse`, or `linkax.linalg.block_elimination.BlockInverse`."""
+
+    def apply(self, f: Float[Array, " n"], gamma: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """Solve for (a, λ)."""
+        ...
 
 
 class SaddleInverse(NamedTuple):
@@ -33,7 +45,7 @@ class SaddleInverse(NamedTuple):
       `with_mass`.
     - `normal` G = B Q₁ R₁₁⁻ᵀ Pᵣᵀ, (n, m): a right inverse of J. `compliance` S = Pᵣ R₁₁⁻¹ R₁₁⁻ᵀ Pᵣᵀ − D, (m, m).
     - `basis` B Q₂: tangent space, (n, n), zero columns where the normal space is.
-    - `rank` r: number of independent rows.
+    - `rank` r: number of independent rows; of each island by `invert_apart`.
     - `distance` d = |R_rr| / |R₁₁|, r the rank here or that of the neighbourhood where it is known; falls to zero in a
       singular configuration. One without rows.
     - `definiteness`: of W: the smallest of the squared diagonal of its Cholesky factor over its own diagonal, or over
@@ -45,11 +57,11 @@ class SaddleInverse(NamedTuple):
     normal: Float[Array, "n m"]
     compliance: Float[Array, "m m"]
     basis: Float[Array, "n n"]
-    rank: Int[Array, ""]
+    rank: Int[Array, "*islands"]
     distance: Float[Array, ""]
     definiteness: Float[Array, ""]
 
-    def apply(self, f, gamma):
+    def apply(self, f: Float[Array, " n"], gamma: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """Solve for (a, λ)."""
         a = self.tangent @ f + self.normal @ gamma
         return a, self.compliance @ gamma - self.normal.T @ f
@@ -61,13 +73,19 @@ class SaddlePoint(eqx.Module):
     mass: Float[Array, "n n"]
     jacobian: Float[Array, "m n"]
 
-    def __call__(self, unknowns):
+    def __call__(self, unknowns: Float[Array, " k"]) -> Float[Array, " k"]:
         a, multipliers = jnp.split(unknowns, [self.mass.shape[0]])
         return jnp.concatenate([self.mass @ a - self.jacobian.T @ multipliers, self.jacobian @ a])
 
 
 @jit_inline
-def invert(weight, jacobian, scales, tolerance, rank_nearby=None) -> SaddleInverse:
+def invert(
+    weight: Float[Array, "n n"] | None,
+    jacobian: Float[Array, "m n"],
+    scales: Float[Array, " n"],
+    tolerance: Scalar | float,
+    rank_nearby: Int[Array | np.integer, ""] | int | None = None,
+) -> SaddleInverse:
     """Split the space of speeds by J and invert the saddle-point system on it.
 
     **Arguments:**
@@ -138,7 +156,12 @@ def _scaled(to_metric, jacobian):
     return weighted * scale, scale
 
 
-def independent(r, tolerance, rank_nearby, largest=None):
+def independent(
+    r: Float[Array, "n m"],
+    tolerance: Scalar | float,
+    rank_nearby: Int[Array | np.integer, ""] | int | None,
+    largest: Float[Array, ""] | None = None,
+) -> tuple[Bool[Array, " k"], Float[Array, ""]]:
     """Find the independent rows among the pivots of R, and the distance d.
 
     **Arguments:** `largest`: |R₁₁| of the whole, where `r` is that of a part.
@@ -154,7 +177,14 @@ def independent(r, tolerance, rank_nearby, largest=None):
     return active, jnp.where(last >= 0, ratio(smallest, largest, 0.0), 1.0)
 
 
-def singularity_distance(weight, jacobian, scales, tolerance, islands, rank_nearby=None) -> Float[Array, ""]:
+def singularity_distance(
+    weight: Float[Array, "n n"] | None,
+    jacobian: Float[Array, "m n"],
+    scales: Float[Array, " n"],
+    tolerance: Scalar | float,
+    islands: Islands,
+    rank_nearby: Int[Array, " k"] | None = None,
+) -> Float[Array, ""]:
     """`SaddleInverse.distance` of `invert_apart`, with derivatives as long as the pivots stay; none where d is zero."""
     each = _over_islands(_distance, weight, jacobian, scales, tolerance, islands, rank_nearby)
     return jnp.min(jnp.concatenate([jnp.ones(1, jacobian.dtype), *(found for *_, found in each)]))
@@ -185,7 +215,14 @@ def _distance(weight, jacobian, scales, tolerance, rank_nearby):
     return jnp.where(is_known, sizes[last] / sizes[0], found)
 
 
-def invert_apart(weight, jacobian, scales, tolerance, islands, rank_nearby=None) -> SaddleInverse:
+def invert_apart(
+    weight: Float[Array, "n n"] | None,
+    jacobian: Float[Array, "m n"],
+    scales: Float[Array, " n"],
+    tolerance: Scalar | float,
+    islands: Islands,
+    rank_nearby: Int[Array, " k"] | None = None,
+) -> SaddleInverse:
     """Invert each island (rows, columns) of a system that falls apart by itself, like `invert`.
 
     Islands of one shape are inverted in one batch. `rank_nearby` is given, and `rank` returned, for each island, (k,);
@@ -229,7 +266,7 @@ def _over_islands(function, weight, jacobian, scales, tolerance, islands, rank_n
         yield index, rows, columns, jax.vmap(function, in_axes=axes)(*inputs)
 
 
-def with_mass(inverse: SaddleInverse, mass) -> SaddleInverse:
+def with_mass(inverse: SaddleInverse, mass: Float[Array, "n n"]) -> SaddleInverse:
     """Replace W by a mass matrix M on the same split; M needs to be definite on the tangent space alone."""
     mass = lax.stop_gradient(mass)
     basis = inverse.basis
@@ -254,7 +291,15 @@ def _lower_inverse(matrix):
 
 
 @jit_inline
-def constrained_solve(inverse, mass, jacobian, f, gamma, refinements: int = 1, product=None):
+def constrained_solve(
+    inverse: Inverse,
+    mass: Float[Array, "n n"],
+    jacobian: Float[Array, "m n"],
+    f: Float[Array, " n"],
+    gamma: Float[Array, " m"],
+    refinements: int = 1,
+    product: Callable[[Array], Array] | None = None,
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
     """Solve M a = f + Jᵀλ, J a = γ, differentiably in M, J, f and γ, in both modes, to any order.
 
     Derivatives are solves of the same system with right-hand sides df − dM a + dJᵀλ and dγ − dJ a; nothing is

@@ -6,9 +6,11 @@ separator, the speeds that later fronts still read. Names and indices only.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -72,7 +74,9 @@ def _filled(sets):
     return np.array([[*members, *(width - len(members)) * [-1]] for members in sets], dtype=int)
 
 
-def plan_elimination(of_rows, coupled, size: int) -> EliminationPlan:
+def plan_elimination(
+    of_rows: Sequence[Int[np.ndarray, " _"]], coupled: Sequence[Int[np.ndarray, " _"]], size: int
+) -> EliminationPlan:
     """Find the fronts of loop rows and inertias.
 
     **Arguments:** `of_rows`: the speeds that each row reads; `coupled`: sets of speeds that inertia couples; `size`: of

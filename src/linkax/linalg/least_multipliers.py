@@ -3,10 +3,11 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Float, Int
 
 from linkax.linalg.constrained_solve import constrained_solve, invert
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 
 
 class LeastMultipliers(NamedTuple):
@@ -20,7 +21,13 @@ class LeastMultipliers(NamedTuple):
     free: Float[Array, "m m"]
 
 
-def least_multipliers(jacobian, multipliers, scales, tolerance, rank) -> LeastMultipliers:
+def least_multipliers(
+    jacobian: Float[Array, "m n"],
+    multipliers: Float[Array, " m"],
+    scales: Float[Array, " n"],
+    tolerance: Scalar | float,
+    rank: Int[Array | np.integer, ""] | int,
+) -> LeastMultipliers:
     """The multipliers of minimum norm with the same Jᵀλ, differentiable like `constrained_solve`.
 
     They solve λ = J y, Jᵀλ = given, a constrained solve too. `scales`, `tolerance`: see `invert`;

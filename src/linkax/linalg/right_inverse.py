@@ -8,6 +8,7 @@ from jax import lax
 from jaxtyping import Float
 
 from linkax.linalg.row_echelon import row_echelon
+from linkax.model.numbers import Number
 from linkax.xla.arrays import Array
 
 ROUNDING_ULPS = 10.0
@@ -17,7 +18,7 @@ def _cut_off(matrix, tolerance):
     return jnp.maximum(tolerance, ROUNDING_ULPS * max(matrix.shape) * jnp.finfo(matrix.dtype).eps)
 
 
-def by_svd(matrix: Float[Array, "m n"], tolerance) -> Float[Array, "n m"]:
+def by_svd(matrix: Float[Array, "m n"], tolerance: Number) -> Float[Array, "n m"]:
     """The Moore-Penrose inverse by singular values, without those below `tolerance` times the largest."""
     left, sizes, right = jnp.linalg.svd(matrix, full_matrices=False)
     kept = sizes > _cut_off(matrix, tolerance) * sizes[0]
@@ -25,7 +26,7 @@ def by_svd(matrix: Float[Array, "m n"], tolerance) -> Float[Array, "n m"]:
     return (right.T * inverse) @ left.T
 
 
-def by_gram_schmidt(matrix: Float[Array, "m n"], tolerance) -> Float[Array, "n m"]:
+def by_gram_schmidt(matrix: Float[Array, "m n"], tolerance: Number) -> Float[Array, "n m"]:
     """The Moore-Penrose inverse of the rows that are independent of those before them.
 
     Rows are orthonormalised one by one, twice; one of which less than `tolerance` of its length
@@ -49,7 +50,7 @@ def by_gram_schmidt(matrix: Float[Array, "m n"], tolerance) -> Float[Array, "n m
     return basis.T @ transform
 
 
-def by_partition(matrix: Float[Array, "m n"], tolerance) -> Float[Array, "n m"]:
+def by_partition(matrix: Float[Array, "m n"], tolerance: Number) -> Float[Array, "n m"]:
     """The right inverse that moves as few unknowns as there are independent rows.
 
     Which ones complete pivoting chooses: those that the rows decide best.

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float, Int
 
+from linkax.model.numbers import Number
 from linkax.xla.arrays import Array
 
 
@@ -24,7 +25,7 @@ class RowEchelon(NamedTuple):
     rank: Int[Array, ""]
 
 
-def row_echelon(matrix: Float[Array, "m n"], tolerance) -> RowEchelon:
+def row_echelon(matrix: Float[Array, "m n"], tolerance: Number) -> RowEchelon:
     """Reduce a matrix of any shape and rank; a pivot is larger than `tolerance` times the first one.
 
     Golub and Van Loan, Matrix Computations (4th ed.), section 3.4.8 for complete pivoting.

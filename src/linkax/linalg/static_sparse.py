@@ -4,11 +4,13 @@ In a large mechanism each body concerns few others. Where few entries are needed
 matrices are multiplied. XLA computes an entry anew wherever it is read, so one such product must not follow another.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 
 from linkax.xla.arrays import Array
 
@@ -16,7 +18,7 @@ SPARSE = 0.25  # of the entries: what is read is slower than what is in order
 LARGE = 256  # entries of a full matrix that are not worth it
 
 
-def constant_product(matrix: np.ndarray, values):
+def constant_product(matrix: Shaped[np.ndarray, "k n"], values: Float[Array, "n ..."]) -> Float[jax.Array, "k ..."]:
     """Multiply a constant matrix (k, n) with `values` (n, …): (k, …)."""
     flat = values.reshape(len(values), -1)
     width = int(np.max(np.count_nonzero(matrix, axis=1), initial=0))
@@ -40,7 +42,7 @@ class StaticSparse(NamedTuple):
     places: np.ndarray
 
     @staticmethod
-    def whole(matrix) -> "StaticSparse":
+    def whole(matrix: Float[Array, "m n"]) -> "StaticSparse":
         """Take all entries of a matrix."""
         return StaticSparse(jnp.ravel(matrix), 1 + np.arange(matrix.size).reshape(matrix.shape))
 
@@ -51,17 +53,19 @@ class StaticSparse(NamedTuple):
         places = [part.places + start * (part.places > 0) for part, start in zip(parts, first, strict=False)]
         return StaticSparse(jnp.concatenate([part.values for part in parts]), np.concatenate(places))
 
-    def at(self, down, across):
+    def at(self, down: Int[np.ndarray, "..."] | slice, across: Int[np.ndarray, "..."] | slice) -> Float[Array, "..."]:
         """Read entries, indexed as in NumPy."""
         nothing = jnp.zeros(1, self.values.dtype)
         return jnp.concatenate([nothing, self.values])[self.places[down, across]]
 
-    def dense(self):
+    def dense(self) -> Float[Array, "m n"]:
         """Read all entries."""
         return self.at(slice(None), slice(None))
 
 
-def products_of_pairs(left: np.ndarray, right: np.ndarray, a, b) -> StaticSparse:
+def products_of_pairs(
+    left: Int[np.ndarray, "..."], right: Int[np.ndarray, "..."], a: Float[Array, "k d"], b: Float[Array, "n d"]
+) -> StaticSparse:
     """The matrix of aᵢ · bⱼ, vectors (k, d) and (n, d), i in `left` and j in `right`; zero where i is −1."""
     present = left >= 0
     pairs, source = np.unique((left * len(b) + right)[present], return_inverse=True)
@@ -78,7 +82,11 @@ def _is_worth_it(read, entries):
     return entries > LARGE and read <= SPARSE * entries
 
 
-def assembled(shape, parts, dtype):
+def assembled(
+    shape: tuple[int, ...],
+    parts: Sequence[tuple[tuple[Int[np.ndarray, "..."], ...], Float[Array, "..."]]],
+    dtype: np.dtype,
+) -> Float[Array, "..."]:
     """Make an array of parts (indices, values), zero elsewhere; indices as in NumPy, one array for each axis."""
     source = np.zeros(shape, dtype=int)
     first = 1

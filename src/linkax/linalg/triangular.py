@@ -12,7 +12,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.batches import small_in_batches
 
 
-def cholesky_inverse(matrix: Float[Array, "n n"]):
+def cholesky_inverse(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """L⁻¹ of a positive definite matrix L Lᵀ, and the diagonal of L; not numbers where it is not definite."""
     return _cholesky_inverse(matrix)
 
@@ -28,7 +28,7 @@ def _by_lapack(matrix):
     return solve_triangular(lower, identity, lower=True), jnp.diagonal(lower)
 
 
-def cholesky_inverse_by_elimination(matrix):
+def cholesky_inverse_by_elimination(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """`cholesky_inverse`, with derivatives: rows of [A, I] less multiples of those above, [Lᵀ, L⁻¹]."""
     n = len(matrix)
     rows = jnp.arange(n)

@@ -1,12 +1,24 @@
 """Newton's method and its like: iterate for as long as it helps."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
+from linkax.xla.arrays import Array, Scalar
 
-def while_falling(improve: Callable, begin, most: int, small, dtype):
+Carry = TypeVar("Carry")
+
+
+def while_falling(
+    improve: Callable[[Carry, Array], tuple[Carry, Array]],
+    begin: Carry,
+    most: int,
+    small: Scalar | float,
+    dtype: np.dtype,
+) -> Carry:
     """Iterate until the residual is small, stops falling, or `most` iterations are done; at least once.
 
     **Arguments:** `improve`: (state, residual of the iteration before, infinite at first) ↦ (state, residual); `begin`:
