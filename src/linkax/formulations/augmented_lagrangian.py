@@ -4,9 +4,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Float
 
 from linkax.formulations.classical import AbstractAcceleration, parameter
 from linkax.model.numbers import Number, whole_number
+from linkax.xla.arrays import Array
 
 
 class AugmentedLagrangian(AbstractAcceleration):
@@ -26,7 +28,13 @@ class AugmentedLagrangian(AbstractAcceleration):
     def __check_init__(self):
         whole_number(self.sweeps, "sweeps of AugmentedLagrangian")
 
-    def __call__(self, mass, jacobian, force, gamma):
+    def __call__(
+        self,
+        mass: Float[Array, "n n"],
+        jacobian: Float[Array, "m n"],
+        force: Float[Array, " n"],
+        gamma: Float[Array, " m"],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         size = self.penalty * jnp.max(jnp.diagonal(mass))
         factor = cho_factor(mass + size * jacobian.T @ jacobian)
         # The first sweep needs M v̇₀ alone, so M may be singular.

@@ -2,11 +2,12 @@
 
 import abc
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from linkax.equations.coordinates import on_manifold, retract
 from linkax.equations.dynamics import generalised_force
@@ -15,12 +16,12 @@ from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Dynamics, LinearSystem, linear_system
 from linkax.model.numbers import Number, whole_number, zero_or_more
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.batches import one_by_one
 from linkax.xla.tracing import jit_inline
 
 
-def parameter(default: float, what: str):
+def parameter(default: float, what: str) -> Any:
     """Make a field for a traced number of a method, zero or more; `what` names it in errors."""
     return eqx.field(default=default, converter=partial(zero_or_more, what=what))
 
@@ -30,7 +31,11 @@ class AbstractAcceleration(eqx.Module):
 
     @abc.abstractmethod
     def __call__(
-        self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"], force: Float[Array, " n"], gamma
+        self,
+        mass: Float[Array, "n n"],
+        jacobian: Float[Array, "m n"],
+        force: Float[Array, " n"],
+        gamma: Float[Array, " m"],
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """Solve for v̇ and λ, of at least one row; not finite where the way fails."""
 
@@ -99,7 +104,7 @@ class ClassicalFormulation(AbstractFormulation):
         whole_number(self.sweeps, "sweeps of ClassicalFormulation")
 
     @property
-    def distance_floor(self):
+    def distance_floor(self) -> float:
         """Distances are not measured, and count as one."""
         return 1.0
 
@@ -122,13 +127,27 @@ class ClassicalFormulation(AbstractFormulation):
         return Dynamics(acceleration, multipliers, at.jacobian @ acceleration - right)
 
     @jit_inline
-    def derivative(self, system: System, t, q, v, correct):
+    def derivative(
+        self,
+        system: System,
+        t: Scalar | float,
+        q: Float[Array, " n_q"],
+        v: Float[Array, " n_v"],
+        correct: bool | Bool[Array, ""],
+    ) -> tuple[Float[Array, " n_v"], Float[Array, " n_v"], Float[Array, " n_q"], Float[Array, ""]]:
         q = on_manifold(system.topology, q)
         solved = self._solved(linear_system(system, t, q), v)
         return v, solved.acceleration, q, jnp.ones((), q.dtype)
 
     @jit_inline
-    def correct(self, system: System, t, q, v, errors=()):
+    def correct(
+        self,
+        system: System,
+        t: Scalar | float,
+        q: Float[Array, " n_q"],
+        v: Float[Array, " n_v"],
+        errors: tuple[Float[Array, " n_v"], ...] = (),
+    ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], tuple[Float[Array, " n_v"], ...], Float[Array, ""]]:
         q, one = on_manifold(system.topology, q), jnp.ones((), q.dtype)
         if self.correction is None or system.topology.num_rows == 0:
             return q, v, errors, one
@@ -146,9 +165,11 @@ class ClassicalFormulation(AbstractFormulation):
         remaining = tuple(error - back @ (at.jacobian @ error) for error in errors)
         return q, v - back @ (at.jacobian @ v - rate(system, t)), remaining, one
 
-    def close(self, system: System, t, q, v):
+    def close(
+        self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"]]:
         q, v, _, _ = self.correct(system, t, q, v)
         return q, v
 
-    def dynamics(self, system: System, t, q, v) -> Dynamics:
+    def dynamics(self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
         return self._solved(linear_system(system, t, q), v)

@@ -5,13 +5,13 @@ acceleration, so γ must lie in the range of J: uᵀγ(v, v) = 0 for every u wit
 equations for the speeds, whose solutions are the branches.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import Configuration, configure
 from linkax.equations.loops import drive_acceleration, jacobian, velocity_gamma
@@ -20,7 +20,7 @@ from linkax.equations.system import System
 from linkax.linalg.constrained_solve import SaddleInverse, constrained_solve, invert_apart
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.spatial.vectors import length
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 
 OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
 
@@ -36,12 +36,14 @@ class ConstraintSplit(eqx.Module):
     inverse: SaddleInverse
 
     @staticmethod
-    def at(system: System, t, q, rank_tolerance) -> "ConstraintSplit":
+    def at(
+        system: System, t: Scalar | float, q: Float[Array, " n_q"], rank_tolerance: Scalar | float
+    ) -> "ConstraintSplit":
         """Split at coordinates q, in the identity metric."""
         return ConstraintSplit.of(configure(system, t, q), rank_tolerance)
 
     @staticmethod
-    def of(configuration: Configuration, rank_tolerance) -> "ConstraintSplit":
+    def of(configuration: Configuration, rank_tolerance: Scalar | float) -> "ConstraintSplit":
         """Split in the identity metric."""
         system, rows = configuration.system, jacobian(configuration)
         inverse = invert_apart(None, rows, system.scales, rank_tolerance, system.structure.islands)
@@ -60,7 +62,7 @@ class ConstraintSplit(eqx.Module):
         size = length(basis / self.configuration.system.scales[:, None], axis=0)
         return basis / jnp.where(size > 0.0, size, 1.0)
 
-    def off_branch(self, v, scale: Any = 1.0) -> Float[Array, " m"]:
+    def off_branch(self, v: Float[Array, " n_v"], scale: Scalar | float = 1.0) -> Float[Array, " m"]:
         """The part of γ(v, v) outside the range of J, (m,): zero for speeds on a branch.
 
         **Arguments:** `scale`: a factor of the speeds v, whose square is one of γ.
@@ -76,7 +78,9 @@ class ConstraintSplit(eqx.Module):
     def _driven(self, scale):
         return drive_acceleration(self.configuration.system, self.configuration.t) / scale**2
 
-    def along(self, v, from_rest) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
+    def along(
+        self, v: Float[Array, " n_v"], from_rest: bool | Bool[Array, ""]
+    ) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
         """How far speeds v, of any size, are from a branch, and the ranks of all islands beside this configuration
         along v.
 

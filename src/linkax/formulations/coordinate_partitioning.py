@@ -1,8 +1,11 @@
 """Generalised coordinate partitioning as a correction."""
 
+from jaxtyping import Float
+
 from linkax.formulations.classical import AbstractCorrection, parameter
 from linkax.linalg.right_inverse import by_partition
 from linkax.model.numbers import Number
+from linkax.xla.arrays import Array
 
 
 class CoordinatePartitioning(AbstractCorrection):
@@ -16,5 +19,5 @@ class CoordinatePartitioning(AbstractCorrection):
 
     tolerance: Number = parameter(1e-6, "tolerance of CoordinatePartitioning")
 
-    def right_inverse(self, mass, jacobian):
+    def right_inverse(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"]) -> Float[Array, "n m"]:
         return by_partition(jacobian, self.tolerance)

@@ -1,17 +1,18 @@
 """What a formulation is: how equations of motion with loops become an ordinary differential equation."""
 
 import abc
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import Configuration, configure
 from linkax.equations.dynamics import mass_entries
 from linkax.equations.loops import jacobian_entries
 from linkax.equations.system import System
 from linkax.linalg.block_elimination import Blocks, in_fronts
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import jit_inline
 
 
@@ -28,7 +29,7 @@ class LinearSystem(NamedTuple):
 
 
 @jit_inline
-def linear_system(system: System, t, q) -> LinearSystem:
+def linear_system(system: System, t: Scalar | float, q: Float[Array, " n_q"]) -> LinearSystem:
     """Compute J and M at coordinates q."""
     configuration = configure(system, t, q)
     rows, mass, plan = jacobian_entries(configuration), mass_entries(configuration), system.structure.elimination
@@ -55,13 +56,13 @@ class AbstractFormulation(eqx.Module):
     Pure functions of (system, t, q, v); see `linkax.TangentSpace` and `linkax.ClassicalFormulation`.
     """
 
-    def prepared(self, dtype, rank_nearby=None) -> "AbstractFormulation":
+    def prepared(self, dtype: np.dtype | type, rank_nearby: Int[Array, " k"] | None = None) -> "AbstractFormulation":
         """The same formulation for a floating-point type, and for the ranks of J along the motion, if it uses them."""
         return self
 
     @property
     @abc.abstractmethod
-    def distance_floor(self) -> Any:
+    def distance_floor(self) -> Scalar | float:
         """The distance d from a singular configuration below which rounding grows no more."""
 
     @property
@@ -70,7 +71,14 @@ class AbstractFormulation(eqx.Module):
         """Whether `correct` moves a state to where its derivative is another one."""
 
     @abc.abstractmethod
-    def derivative(self, system: System, t: Any, q: Any, v: Any, correct: Any) -> Any:
+    def derivative(
+        self,
+        system: System,
+        t: Scalar | float,
+        q: Float[Array, " n_q"],
+        v: Float[Array, " n_v"],
+        correct: bool | Bool[Array, ""],
+    ) -> tuple[Float[Array, " n_v"], Float[Array, " n_v"], Float[Array, " n_q"], Float[Array, ""]]:
         """Compute (v, v̇, q, d): speeds, accelerations, where they hold, and the distance from a singular
         configuration.
 
@@ -79,13 +87,22 @@ class AbstractFormulation(eqx.Module):
         """
 
     @abc.abstractmethod
-    def correct(self, system: System, t: Any, q: Any, v: Any, errors: Any = ()) -> Any:
+    def correct(
+        self,
+        system: System,
+        t: Scalar | float,
+        q: Float[Array, " n_q"],
+        v: Float[Array, " n_v"],
+        errors: tuple[Float[Array, " n_v"], ...] = (),
+    ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], tuple[Float[Array, " n_v"], ...], Float[Array, ""]]:
         """Correct the state after a step: (q, v, what remains of `errors` in it, d)."""
 
     @abc.abstractmethod
-    def close(self, system: System, t: Any, q: Any, v: Any) -> Any:
+    def close(
+        self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"]]:
         """Compute q and v as they are saved and read."""
 
     @abc.abstractmethod
-    def dynamics(self, system: System, t: Any, q: Any, v: Any) -> Dynamics:
+    def dynamics(self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
         """Compute accelerations and multipliers at a saved state."""

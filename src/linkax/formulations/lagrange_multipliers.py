@@ -3,8 +3,10 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Float
 
 from linkax.formulations.classical import AbstractAcceleration
+from linkax.xla.arrays import Array
 
 
 class LagrangeMultipliers(AbstractAcceleration):
@@ -18,7 +20,13 @@ class LagrangeMultipliers(AbstractAcceleration):
 
     block: bool = eqx.field(static=True, default=False)
 
-    def __call__(self, mass, jacobian, force, gamma):
+    def __call__(
+        self,
+        mass: Float[Array, "n n"],
+        jacobian: Float[Array, "m n"],
+        force: Float[Array, " n"],
+        gamma: Float[Array, " m"],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         m, n = jacobian.shape
         if self.block:
             matrix = jnp.block([[mass, -jacobian.T], [jacobian, jnp.zeros((m, m), mass.dtype)]])

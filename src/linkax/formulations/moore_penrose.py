@@ -1,19 +1,27 @@
 """Accelerations by the Moore-Penrose inverse of the loop rows in the mass metric."""
 
+from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
+from jaxtyping import Float
 
 from linkax.formulations.classical import AbstractAcceleration, AbstractCorrection, parameter
 from linkax.linalg.right_inverse import by_gram_schmidt, by_svd
 from linkax.model.numbers import Number
+from linkax.xla.arrays import Array
 
 INVERSES = {"svd": by_svd, "gram-schmidt": by_gram_schmidt}
 
 
-def mass_orthogonal_inverse(mass, jacobian, inverse, tolerance):
+def mass_orthogonal_inverse(
+    mass: Float[Array, "n n"],
+    jacobian: Float[Array, "m n"],
+    inverse: Callable[[Array, Number], Array],
+    tolerance: Number,
+) -> Float[Array, "n m"]:
     """The right inverse of J whose columns are M-orthogonal to the tangent space: L⁻ᵀ (J L⁻ᵀ)⁺, M = L Lᵀ."""
     lower = jnp.linalg.cholesky(mass)
     weighted = solve_triangular(lower, jacobian.T, lower=True).T
@@ -40,7 +48,13 @@ class MoorePenrose(AbstractAcceleration):
         if self.inverse not in INVERSES:
             raise ValueError(f"inverse of MoorePenrose is {self.inverse!r}; known: {', '.join(map(repr, INVERSES))}")
 
-    def __call__(self, mass, jacobian, force, gamma):
+    def __call__(
+        self,
+        mass: Float[Array, "n n"],
+        jacobian: Float[Array, "m n"],
+        force: Float[Array, " n"],
+        gamma: Float[Array, " m"],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         back = mass_orthogonal_inverse(mass, jacobian, INVERSES[self.inverse], self.tolerance)
         free = cho_solve(cho_factor(mass), force)
         added = back @ (gamma - jacobian @ free)
@@ -55,5 +69,5 @@ class MassOrthogonalProjection(AbstractCorrection):
 
     tolerance: Number = parameter(1e-6, "tolerance of MassOrthogonalProjection")
 
-    def right_inverse(self, mass, jacobian):
+    def right_inverse(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"]) -> Float[Array, "n m"]:
         return mass_orthogonal_inverse(mass, jacobian, by_svd, self.tolerance)

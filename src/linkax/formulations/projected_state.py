@@ -5,13 +5,13 @@ Each function takes (method, system, t, q, v). What is differentiated are the eq
 `linkax.formulations.singular_limit`.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import on_manifold, retract
@@ -27,13 +27,17 @@ from linkax.linalg.constrained_solve import SaddleInverse
 from linkax.linalg.least_multipliers import least_multipliers
 from linkax.linalg.while_falling import while_falling
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import jit_inline
 
 ROUNDING_ULPS = 8.0
 MOST_CORRECTIONS = 20
 ALONG = (1e-4, 1e-3, 1e-2)  # radians or lengths of the mechanism, along which ranks of fronts show
+
+
+# Of a `TangentSpace`, which calls these functions, and a state: (method, system, t, q, v).
+Arguments = tuple[Any, System, Scalar | float, Float[Array, " n_q"], Float[Array, " n_v"]]
 
 
 class Evaluated(NamedTuple):
@@ -47,7 +51,7 @@ class Evaluated(NamedTuple):
 
 
 @eqx.filter_custom_jvp
-def evaluate(arguments, correct) -> Evaluated:
+def evaluate(arguments: Arguments, correct: bool | Bool[Array, ""]) -> Evaluated:
     """The acceleration at a state, or at the one on the loops next to it: one factorisation, at q."""
     method, system, t, q, v = arguments
     linear = linear_system(system, t, q if correct is False else on_manifold(system.topology, q))
@@ -75,7 +79,9 @@ def _evaluate_jvp(primals, tangents):
 
 
 @eqx.filter_custom_jvp
-def correct(arguments):
+def correct(
+    arguments: Arguments,
+) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], SaddleInverse | BlockInverse]:
     """The state on the loops next to one that is close, and the split that corrected it."""
     method, system, t, q, v = arguments
     linear = linear_system(system, t, on_manifold(system.topology, q))
@@ -95,7 +101,7 @@ def _correct_jvp(primals, tangents):
 
 
 @eqx.filter_custom_jvp
-def close(arguments):
+def close(arguments: Arguments) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"]]:
     """The state on the loops to rounding, with fresh factors, close to a singular configuration as a limit."""
     method, system, t, q, v = arguments
     (q, v), _ = _limit(_closed_at, (0, 1), method, system, t, q, v)
@@ -112,7 +118,9 @@ def _close_jvp(primals, tangents):
     return (q, v), (state.to_q, state.to_v)
 
 
-def approach(method, system, t, q, v):
+def approach(
+    method: Any, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], Float[Array, ""]]:
     """Newton steps on q until the loops close to rounding or stop closing further, then v: (q, v, d)."""
     small = ROUNDING_ULPS * jnp.finfo(q.dtype).eps
 
@@ -130,7 +138,14 @@ def approach(method, system, t, q, v):
     return while_falling(improve, begin, MOST_CORRECTIONS, small, q.dtype)
 
 
-def ranks_along(method, system: System, t, q, v, rank) -> Int[Array, " k"]:
+def ranks_along(
+    method: Any,
+    system: System,
+    t: Scalar | float,
+    q: Float[Array, " n_q"],
+    v: Float[Array, " n_v"],
+    rank: Int[Array, " n_islands"],
+) -> Int[Array, " k"]:
     """The rank of J of each front along the motion from q with speeds v, of any size; without fronts of each island.
 
     `rank`: of each island. Ranks of fronts show at states a little farther on; where they do not add up to it there,
@@ -152,13 +167,17 @@ def ranks_along(method, system: System, t, q, v, rank) -> Int[Array, " k"]:
     return jnp.where(adds_up, ranks, plan.most_independent)
 
 
-def limit_of_acceleration(method, system, t, q, v) -> Float[Array, " n_v"]:
+def limit_of_acceleration(
+    method: Any, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+) -> Float[Array, " n_v"]:
     """v̇ at a state on the loops, close to a singular configuration as a limit along the motion."""
     (_, acceleration), _ = _limit(_acceleration_at, (0, 2), method, system, t, q, v)
     return acceleration
 
 
-def limit_of_multipliers(method, system, t, q, v) -> Float[Array, " m"]:
+def limit_of_multipliers(
+    method: Any, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+) -> Float[Array, " m"]:
     """λ of minimum norm at a state on the loops, close to a singular configuration as a limit along the motion."""
     (_, per_inertia), _ = _limit(_multipliers_at, (0, 2), method, system, t, q, v)
     return per_inertia * _inertia(system)

@@ -1,10 +1,12 @@
 """The projection operator onto the tangent space."""
 
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from linkax.formulations.classical import AbstractAcceleration, parameter
 from linkax.linalg.right_inverse import by_svd
 from linkax.model.numbers import Number
+from linkax.xla.arrays import Array
 
 
 class ProjectionOperator(AbstractAcceleration):
@@ -17,7 +19,13 @@ class ProjectionOperator(AbstractAcceleration):
 
     tolerance: Number = parameter(1e-6, "tolerance of ProjectionOperator")
 
-    def __call__(self, mass, jacobian, force, gamma):
+    def __call__(
+        self,
+        mass: Float[Array, "n n"],
+        jacobian: Float[Array, "m n"],
+        force: Float[Array, " n"],
+        gamma: Float[Array, " m"],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         back = by_svd(jacobian, self.tolerance)
         projector = jnp.eye(len(force), dtype=mass.dtype) - back @ jacobian
         projected = projector @ mass

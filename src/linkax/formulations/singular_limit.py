@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
 from linkax.xla.primitives import bounded_while_loop
 
@@ -67,15 +67,17 @@ class Direction(NamedTuple):
     - `advances`: whether time goes on with the motion, as it must where drives prescribe it.
     """
 
-    t: Float[Array, ""]
+    t: Scalar | float
     q: Float[Array, " n_q"]
     v: Float[Array, " n_v"]
     fastest: Float[Array, ""]
-    retract: Callable
+    retract: Callable[[Array, Array], Array]
     advances: bool
 
 
-def singular_limit(function, powers, arguments, direction: Direction):
+def singular_limit(
+    function: Callable[[Any, Any, Array], Value], powers: tuple[int, ...], arguments: PyTree, direction: Direction
+) -> tuple[Any, Float[Array, ""]]:
     """Evaluate a function of the coordinates, close to a singular configuration as a limit along v.
 
     Costs one evaluation where d ≥ NEAR, and ten where it is smaller. One loop serves both, so

@@ -5,8 +5,10 @@ from typing import Any, cast
 
 import numpy as np
 from jax import lax
+from jaxtyping import Float
 
 from linkax.formulations.classical import AbstractAcceleration, AbstractCorrection, ClassicalFormulation
+from linkax.xla.arrays import Array
 
 
 class _OneAcceleration(AbstractAcceleration):
@@ -15,7 +17,13 @@ class _OneAcceleration(AbstractAcceleration):
     choices: tuple[AbstractAcceleration, ...]
     index: np.ndarray
 
-    def __call__(self, mass, jacobian, force, gamma):
+    def __call__(
+        self,
+        mass: Float[Array, "n n"],
+        jacobian: Float[Array, "m n"],
+        force: Float[Array, " n"],
+        gamma: Float[Array, " m"],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         choices = [lambda *system, choice=choice: choice(*system) for choice in self.choices]
         return lax.switch(self.index, choices, mass, jacobian, force, gamma)
 
@@ -26,7 +34,7 @@ class _OneCorrection(AbstractCorrection):
     choices: tuple[AbstractCorrection, ...]
     index: np.ndarray
 
-    def right_inverse(self, mass, jacobian):
+    def right_inverse(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"]) -> Float[Array, "n m"]:
         choices = [lambda *system, choice=choice: choice.right_inverse(*system) for choice in self.choices]
         return lax.switch(self.index, choices, mass, jacobian)
 

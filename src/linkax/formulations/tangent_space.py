@@ -33,9 +33,9 @@ from linkax.linalg.constrained_solve import (
     singularity_distance,
     with_mass,
 )
-from linkax.model.numbers import number, one_of, require, whole_number
+from linkax.model.numbers import Number, number, one_of, require, whole_number
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import jit_inline
 
 Metric = Literal["mass", "identity"]
@@ -66,8 +66,8 @@ class TangentSpace(AbstractFormulation):
     metric: Metric = eqx.field(static=True)
     corrections: int = eqx.field(static=True)
 
-    def __init__(self, rank_tolerance=None, *, metric: Metric = "mass", corrections: int = 1):
-        self.rank_tolerance = rank_tolerance
+    def __init__(self, rank_tolerance: Number | None = None, *, metric: Metric = "mass", corrections: int = 1) -> None:
+        self.rank_tolerance = None
         if rank_tolerance is not None:
             within = lambda tolerance: (tolerance > 0.0) & (tolerance <= 1.0)
             remedy = "it must be positive, and at most 1, such as 1e-6"
@@ -77,7 +77,7 @@ class TangentSpace(AbstractFormulation):
         self.metric = one_of(metric, get_args(Metric), "metric")
         self.corrections = whole_number(corrections, "corrections")
 
-    def prepared(self, dtype, rank_nearby=None) -> "TangentSpace":
+    def prepared(self, dtype: np.dtype | type, rank_nearby: Int[Array, " k"] | None = None) -> "TangentSpace":
         """Fill in τ for a floating-point type, and the rank of J along the motion where it is known.
 
         `rank_nearby`: of each island of the mechanism, or of each front of its elimination plan, (k,), see
@@ -113,7 +113,11 @@ class TangentSpace(AbstractFormulation):
         return self._split_by_blocks(linear, self._weight_blocks(linear))
 
     def correct_position(
-        self, linear: LinearSystem, split, configuration: Configuration, correct: bool | Bool[Array, ""] = True
+        self,
+        linear: LinearSystem,
+        split: SaddleInverse | BlockInverse,
+        configuration: Configuration,
+        correct: bool | Bool[Array, ""] = True,
     ) -> Float[Array, " n_q"]:
         """q ← q ⊕ δ with the smallest δ that has J δ = −c: δ = −L⁻ᵀ Q₁ R₁₁⁻ᵀ (Pᵀ c)ᵣ (paper, position correction).
 
@@ -124,7 +128,9 @@ class TangentSpace(AbstractFormulation):
         change = change if correct is True else jnp.where(correct, change, 0.0)
         return retract(configuration.system.topology, configuration.q, change)
 
-    def correct_velocity(self, linear: LinearSystem, split, v, refinements: int) -> Float[Array, " n_v"]:
+    def correct_velocity(
+        self, linear: LinearSystem, split: SaddleInverse | BlockInverse, v: Float[Array, " n_v"], refinements: int
+    ) -> Float[Array, " n_v"]:
         """The speeds nearest to v with J v = b: v ← L⁻ᵀ [Q₂ Q₂ᵀ w + Q₁ R₁₁⁻ᵀ (Pᵀ b)ᵣ], w = Lᵀ v (paper, velocities).
 
         `refinements`: steps of iterative refinement, for factors of a configuration close by.
@@ -135,7 +141,14 @@ class TangentSpace(AbstractFormulation):
         momentum = product(jnp.concatenate([v, jnp.zeros_like(b)]))[: len(v)]
         return constrained_solve(split, weight, linear.jacobian, momentum, b, refinements, product)[0]
 
-    def solve_accelerations(self, linear: LinearSystem, split, f, gamma, refinements: int):
+    def solve_accelerations(
+        self,
+        linear: LinearSystem,
+        split: SaddleInverse | BlockInverse,
+        f: Float[Array, " n_v"],
+        gamma: Float[Array, " m"],
+        refinements: int,
+    ) -> tuple[Float[Array, " n_v"], Float[Array, " m"]]:
         """v̇ and λ of M v̇ = f + Jᵀλ, J v̇ = γ, by the projected equation (paper, equations of motion).
 
         With B = L⁻ᵀ: v̇ = B Q₁ R₁₁⁻ᵀ (Pᵀγ)ᵣ + B Q₂ ζ, where (B Q₂)ᵀ M (B Q₂) ζ = (B Q₂)ᵀ (f − M B Q₁ R₁₁⁻ᵀ (Pᵀγ)ᵣ);
@@ -147,7 +160,9 @@ class TangentSpace(AbstractFormulation):
         product = self._saddle_point(linear, linear.mass, linear.blocks)
         return constrained_solve(inverse, linear.mass, linear.jacobian, f, gamma, refinements, product)
 
-    def tangential_part(self, linear: LinearSystem, split, change) -> Float[Array, " n_v"]:
+    def tangential_part(
+        self, linear: LinearSystem, split: SaddleInverse | BlockInverse, change: Float[Array, " n_v"]
+    ) -> Float[Array, " n_v"]:
         """The part of a change that keeps the loops closed: L⁻ᵀ Q₂ Q₂ᵀ Lᵀ δ. Errors of a state have this part only."""
         product = self._saddle_point(linear, self._weight(linear), self._weight_blocks(linear))
         none = jnp.zeros(linear.jacobian.shape[0], change.dtype)
@@ -156,7 +171,9 @@ class TangentSpace(AbstractFormulation):
         opened = product(jnp.concatenate([along, none]))[len(change) :]
         return along - split.apply(jnp.zeros_like(change), opened)[0]
 
-    def least_change(self, linear: LinearSystem, split, rows, refinements: int) -> Float[Array, " n_v"]:
+    def least_change(
+        self, linear: LinearSystem, split: SaddleInverse | BlockInverse, rows: Float[Array, " m"], refinements: int
+    ) -> Float[Array, " n_v"]:
         """The smallest change δ of coordinates or speeds with J δ = rows: L⁻ᵀ Q₁ R₁₁⁻ᵀ (Pᵀ rows)ᵣ."""
         weight = self._weight(linear)
         still = jnp.zeros(weight.shape[0], weight.dtype)
@@ -208,13 +225,27 @@ class TangentSpace(AbstractFormulation):
         return None if self.rank_nearby is None else system.structure.ranks_of_islands(self.rank_nearby)
 
     @jit_inline
-    def derivative(self, system: System, t, q, v, correct):
+    def derivative(
+        self,
+        system: System,
+        t: Scalar | float,
+        q: Float[Array, " n_q"],
+        v: Float[Array, " n_v"],
+        correct: bool | Bool[Array, ""],
+    ) -> tuple[Float[Array, " n_v"], Float[Array, " n_v"], Float[Array, " n_q"], Float[Array, ""]]:
         """v and v̇ at (t, q, v), corrected before the equations of motion are formed, q and d there."""
         found = projected_state.evaluate((self, system, t, q, v), correct if system.topology.num_rows > 0 else False)
         return found.v, found.acceleration, found.q, found.split.distance
 
     @jit_inline
-    def correct(self, system: System, t, q, v, errors=()):
+    def correct(
+        self,
+        system: System,
+        t: Scalar | float,
+        q: Float[Array, " n_q"],
+        v: Float[Array, " n_v"],
+        errors: tuple[Float[Array, " n_v"], ...] = (),
+    ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], tuple[Float[Array, " n_v"], ...], Float[Array, ""]]:
         """q and v moved onto the manifold, for states close to it, and the distance d there.
 
         `errors`, of q and of v, (n_v,) each, are estimates of errors of the state. Of them only the
@@ -232,14 +263,16 @@ class TangentSpace(AbstractFormulation):
         return q, v, errors, split.distance
 
     @jit_inline
-    def close(self, system: System, t, q, v):
+    def close(
+        self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"]]:
         """q and v on the manifold to rounding, from any state near it, with fresh factors."""
         if system.topology.num_rows == 0:
             return on_manifold(system.topology, q), v
         return projected_state.close((self, system, t, q, v))
 
     @jit_inline
-    def dynamics(self, system: System, t, q, v) -> Dynamics:
+    def dynamics(self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
         """Accelerations and multipliers at a state on the manifold."""
         linear = linear_system(system, t, q)
         split = self.split(linear)
@@ -254,7 +287,9 @@ class TangentSpace(AbstractFormulation):
         return Dynamics(acceleration, multipliers, violation)
 
     @jit_inline
-    def least_multipliers(self, system: System, t, q, v) -> Float[Array, " m"]:
+    def least_multipliers(
+        self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    ) -> Float[Array, " m"]:
         """Multipliers of minimum norm at a state on the manifold, close to a singular configuration as a limit.
 
         There J has fewer independent rows than the motion needs. Not numbers where motion goes through it and they
@@ -262,26 +297,28 @@ class TangentSpace(AbstractFormulation):
         """
         return projected_state.limit_of_multipliers(self, system, t, q, v)
 
-    def constraint_split(self, system: System, t, q) -> ConstraintSplit:
+    def constraint_split(self, system: System, t: Scalar | float, q: Float[Array, " n_q"]) -> ConstraintSplit:
         """J and its split, with a basis of the tangent space, at coordinates q."""
         linear = linear_system(system, t, q)
         return ConstraintSplit(linear.configuration, linear.jacobian, self._split_at_once(linear))
 
-    def right_inverse(self, system: System, t, q):
+    def right_inverse(
+        self, system: System, t: Scalar | float, q: Float[Array, " n_q"]
+    ) -> tuple[Float[Array, "m n_v"], Float[Array, "n_v m"], Float[Array, ""]]:
         """J, (m, n_v), a right inverse G of its independent rows, (n_v, m), and d at coordinates q."""
         linear = linear_system(system, t, q)
         split, (rows, n) = self.split(linear), linear.jacobian.shape
         column = lambda gamma: split.apply(jnp.zeros(n, gamma.dtype), gamma)[0]
         return linear.jacobian, jax.vmap(column, out_axes=1)(jnp.eye(rows, dtype=q.dtype)), split.distance
 
-    def distance(self, system: System, t, q) -> Float[Array, ""]:
+    def distance(self, system: System, t: Scalar | float, q: Float[Array, " n_q"]) -> Float[Array, ""]:
         """The distance d from the nearest singular configuration, with derivatives."""
         linear = linear_system(system, t, q)
         weight = linear.mass if self.metric == "mass" else None
         islands, ranks = system.structure.islands, self._ranks_of_islands(system)
         return singularity_distance(weight, linear.jacobian, system.scales, self.tolerance, islands, ranks)
 
-    def at_rest(self, system: System, t, q) -> AtRest:
+    def at_rest(self, system: System, t: Scalar | float, q: Float[Array, " n_q"]) -> AtRest:
         """The acceleration from rest at coordinates q, and what selects its branch."""
         linear = linear_system(system, t, q)
         split, rest = self._split_at_once(linear), jnp.zeros(system.topology.num_speeds, system.dtype)

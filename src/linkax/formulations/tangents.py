@@ -17,7 +17,7 @@ from linkax.equations.dynamics import unbalanced_force
 from linkax.equations.loops import gamma, jacobian, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import materialise, pushforward
 
 
@@ -45,7 +45,14 @@ class StateTangent(NamedTuple):
     to_v: Float[Array, " n_v"]
 
 
-def state_tangent(onto: Callable | None, system: System, t, q, v, tangents: Tangents) -> StateTangent:
+def state_tangent(
+    onto: Callable[[Array], Array] | None,
+    system: System,
+    t: Scalar | float,
+    q: Float[Array, " n_q"],
+    v: Float[Array, " n_v"],
+    tangents: Tangents,
+) -> StateTangent:
     """The state nearest to one that tangents, on loops that change.
 
     `onto`: rows -> the smallest change of coordinates or speeds with that change of the rows J; or None, for a state
@@ -69,7 +76,9 @@ def state_tangent(onto: Callable | None, system: System, t, q, v, tangents: Tang
     return StateTangent(configuration, rows, v, to_configuration, to_rows, to_q, to_v)
 
 
-def unbalanced_tangent(state: StateTangent, acceleration, multipliers):
+def unbalanced_tangent(
+    state: StateTangent, acceleration: Float[Array, " n_v"], multipliers: Float[Array, " m"]
+) -> tuple[Float[Array, " n_v"], Float[Array, " m"]]:
     """How f − M v̇ + Jᵀλ and γ − J v̇ change at given v̇ and λ: right-hand sides for the tangents of these."""
 
     def sides(configuration, rows, v):
