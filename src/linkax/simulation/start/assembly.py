@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, on_manifold
@@ -13,12 +14,14 @@ from linkax.equations.gaps import Gap, gaps
 from linkax.equations.system import system_of
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import Number
 from linkax.simulation.start.branch_speeds import other_speeds, speeds_on_branch
 from linkax.simulation.start.closing import CLOSED, LoopClosure, close_loops
 from linkax.simulation.start.initial_state import ON_BRANCH, moving_joints
 from linkax.simulation.start.nearest_solution import beams_of, rank_tolerance
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import (
+    JointNumbers,
     JointValues,
     by_joint,
     check_mechanism,
@@ -38,7 +41,14 @@ class AssemblyWarning(UserWarning):
     """The loops of a mechanism close only where beams are strained, or leave open on which branch it moves."""
 
 
-def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t=0.0) -> State:
+def assemble(
+    mechanism: Mechanism,
+    positions: JointNumbers | None = None,
+    speeds: JointNumbers | None = None,
+    *,
+    guess: JointNumbers | None = None,
+    t: Number = 0.0,
+) -> State:
     """Find a state on the closed loops, from coordinates and speeds of some of the joints.
 
     **Arguments:**
@@ -71,14 +81,12 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
     """
     check_mechanism(mechanism)
     t = jnp.asarray(checked_time(t, "t"))
-    positions, guess = (
-        coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess"))
-    )
-    speeds = by_joint(mechanism, speeds, "speed", lambda joint: len(joint.speed_units))
-    for name, _ in guess.terms:
+    held, begin = (coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess")))
+    moving = by_joint(mechanism, speeds, "speed", lambda joint: len(joint.speed_units))
+    for name, _ in begin.terms:
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
-    state, remainder = _assemble(mechanism, positions, speeds, guess, t)
+    state, remainder = _assemble(mechanism, held, moving, begin, t)
     if not all_concrete((state, remainder)):
         return State(state.q, jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf))
     remainder = jax.tree.map(np.asarray, remainder)
@@ -92,7 +100,7 @@ def assemble(mechanism: Mechanism, positions=None, speeds=None, *, guess=None, t
                 AssemblyWarning,
                 stacklevel=2,
             )
-    if remainder.undecided and (names := _open_speeds(mechanism, speeds, t, state)):
+    if remainder.undecided and (names := _open_speeds(mechanism, moving, t, state)):
         warnings.warn(
             f"the configuration is singular, and the speeds asked fit several branches of the motion, which differ in "
             f"the speeds of joints {names}; to choose a branch, ask for the speeds of some of these, too",
@@ -158,11 +166,11 @@ class _Remainder(eqx.Module):
     strained: dict
 
     @property
-    def most(self):
+    def most(self) -> Float[Array, ""]:
         """The largest miss of coordinates and speeds that counts as none."""
         return CLOSED * jnp.maximum(self.length, 1.0)
 
-    def is_met(self):
+    def is_met(self) -> Bool[Array, ""]:
         """Whether the loops are closed and all that is held is met."""
         missed = [*self.positions.values, *self.speeds.values, self.gap.constraints]
         met = jnp.all(self.gap.distance <= CLOSED * self.length) & jnp.all(self.gap.angle <= CLOSED)

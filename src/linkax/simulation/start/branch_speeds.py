@@ -5,19 +5,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Bool, Float
 
-from linkax.equations.configuration import configure
+from linkax.equations.configuration import Configuration, configure
 from linkax.equations.loops import rate
 from linkax.equations.motion import move
-from linkax.equations.system import system_of
+from linkax.equations.system import System, system_of
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.linalg.constrained_solve import invert
+from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.initial_state import ON_BRANCH
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import materialise, pushforward, ratio
 from linkax.xla.tracing import quick_compile
 
@@ -37,31 +39,31 @@ class _Asked(eqx.Module):
     right: Array
     scale: Array
 
-    def rest(self, v):
+    def rest(self, v: Float[Array, " n_v"]) -> Float[Array, " n"]:
         """The residual of the equations at speeds v."""
         return jnp.concatenate([self.right - self.rows @ v, -self.crossing.off_branch(v, self.scale)])
 
     @property
-    def system(self):
+    def system(self) -> System:
         return self.crossing.configuration.system
 
-    def slopes(self, v):
+    def slopes(self, v: Float[Array, " n_v"]) -> Float[Array, "n n_v"]:
         return -jax.jacfwd(self.rest)(v)
 
-    def next_to(self, v, tolerance=None):
+    def next_to(self, v: Float[Array, " n_v"], tolerance: Scalar | None = None) -> Float[Array, " n_v"]:
         """The speeds nearest to v that satisfy the rows, on a branch or not."""
         return nearest_solution(self.system, v, self.rows, self.right, tolerance)
 
-    def missed(self, v):
+    def missed(self, v: Float[Array, " n_v"]) -> Float[Array, ""]:
         """The largest miss of the rows."""
         return largest(self.right - self.rows @ v)
 
-    def aside(self, count):
+    def aside(self, count: int) -> Float[Array, "{count} n_v"]:
         """Other speeds that satisfy the rows, on a branch or not, (count, n_v)."""
         anywhere = SPREAD * np.random.default_rng(0).normal(size=(count, len(self.system.scales)))
         return jax.vmap(self.next_to)(jnp.asarray(anywhere, self.right.dtype) * self.system.scales)
 
-    def least(self):
+    def least(self) -> tuple[Float[Array, " n_v"], Bool[Array, ""]]:
         """The smallest speeds that satisfy the rows; close to a singular configuration those on the branch of the
         position.
 
@@ -75,7 +77,7 @@ class _Asked(eqx.Module):
         moves = largest(self.right) > 0.0
         return jnp.where(told, within, least), moves & (off[1] > BESIDE) & jnp.logical_not(told_apart)
 
-    def off_branch(self, v):
+    def off_branch(self, v: Float[Array, " n_v"]) -> Float[Array, ""]:
         """How far speeds are from a branch, over the square of the largest."""
         fastest = self.system.fastest(v)
         off = largest(self.crossing.off_branch(v, self.scale))
@@ -112,7 +114,9 @@ def _asked(configuration, held):
     return _Asked(crossing, rows, right / scale, scale)
 
 
-def speeds_on_branch(configuration, held):
+def speeds_on_branch(
+    configuration: Configuration, held: JointValues
+) -> tuple[Float[Array, " n_v"], JointValues, Float[Array, ""], Bool[Array, ""]]:
     """Find the smallest speeds with those of some joints held, or, near them, speeds on a branch of the motion.
 
     Speeds satisfy J v = b, and γ(v, v) is in the range of J; where the rank of J is constant, the
@@ -133,7 +137,9 @@ def speeds_on_branch(configuration, held):
 
 
 @quick_compile
-def other_speeds(mechanism, held, t, q, v):
+def other_speeds(
+    mechanism: Mechanism, held: JointValues, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+) -> tuple[Float[Array, "k n_v"], Bool[Array, " k"]]:
     """Speeds on other branches than v, with those of joints held: candidates, (k, n_v), and which of them are valid."""
     configuration = configure(system_of(mechanism, q.dtype), t, q)
     asked = _asked(configuration, held)

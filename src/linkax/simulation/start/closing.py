@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Bool, Float
 
-from linkax.equations.configuration import configure
+from linkax.equations.configuration import Configuration, configure
 from linkax.equations.coordinates import rates, retract, speeds
 from linkax.equations.gaps import as_if_closed, flips
 from linkax.equations.loops import jacobian, residual
@@ -38,7 +39,7 @@ class LoopClosure(eqx.Module):
     t: Array
     held: JointValues
 
-    def misses(self, configuration):
+    def misses(self, configuration: Configuration) -> tuple[Float[Array, " _"], ...]:
         """How far joints are from where they are held, one number for each speed, by joint."""
         topology, apart = self.system.topology, []
         for along, entry in zip(self.held.terms, self.held.values, strict=True):
@@ -55,11 +56,11 @@ class LoopClosure(eqx.Module):
             apart.append(jnp.concatenate([jnp.zeros(0, self.system.dtype), *missed]))
         return tuple(apart)
 
-    def rows(self, configuration):
+    def rows(self, configuration: Configuration) -> Float[Array, " n"]:
         """All residuals: loop rows, flipped axes, misses."""
         return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(configuration)])
 
-    def linearised(self, q):
+    def linearised(self, q: Float[Array, " n_q"]) -> tuple[Float[Array, " n"], Float[Array, "n n_v"]]:
         """The residuals and their derivative where the loops are closed; elsewhere the direction that closes them."""
         configuration, held = configure(self.system, self.t, q), ()
         if self.held.terms:
@@ -69,13 +70,13 @@ class LoopClosure(eqx.Module):
         close_loops = as_if_closed(configuration)
         return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], *held])
 
-    def back(self, q, guess):
+    def back(self, q: Float[Array, " n_q"], guess: Float[Array, " n_q"]) -> Float[Array, " n_v"]:
         """The change that undoes the change of strains since a guess."""
         change = speeds(self.system.topology, q, guess - q)
         strains = strains_of(self.system)
         return scatter_static(jnp.zeros_like(change), strains, change[strains])
 
-    def metrics(self):
+    def metrics(self) -> Float[Array, "2 n_v n_v"]:
         """Two metrics, in radians and lengths, with strains by energy, over that of the softest or of the hardest
         strain.
         """
@@ -85,7 +86,7 @@ class LoopClosure(eqx.Module):
         of = lambda size: jnp.diag(scales**-2).at[np.ix_(strains, strains)].set(energy / size)
         return jax.vmap(of)(jnp.stack([jnp.min(sizes), jnp.max(sizes)]))
 
-    def descent(self, rows, slopes):
+    def descent(self, rows: Float[Array, " n"], slopes: Float[Array, "n n_v"]) -> Float[Array, " n_v"]:
         """The steepest descent of the squared residuals, without strains, as long as their linearisation says."""
         strains = strains_of(self.system)
         downhill = scatter_static(
@@ -95,7 +96,13 @@ class LoopClosure(eqx.Module):
         scale = jnp.sum(change * change)
         return downhill * ratio(-(rows @ change), scale, 0.0)
 
-    def meet(self, q, guess, moves, weight):
+    def meet(
+        self,
+        q: Float[Array, " n_q"],
+        guess: Float[Array, " n_q"],
+        moves: Bool[Array, " n_v"],
+        weight: Float[Array, ""],
+    ) -> tuple[Float[Array, " n_q"], Float[Array, ""]]:
         """Take damped Newton steps from q until residuals and strains vanish or stop falling; descend where those fail.
 
         **Arguments:** `guess`: coordinates whose strains they lead back to; `moves`: which coordinates they change;
@@ -137,7 +144,7 @@ class LoopClosure(eqx.Module):
 
         return while_falling(improve, (q, jnp.asarray(jnp.inf, q.dtype)), MOST_STEPS, SMALL, q.dtype)
 
-    def search(self, q):
+    def search(self, q: Float[Array, " n_q"]) -> Float[Array, " n_q"]:
         """Find coordinates that close the loops, from q, or else from beside it; those nearest to it where none do."""
         fixed = np.isin(np.arange(self.system.topology.num_speeds), strains_of(self.system))
         # Beams are strained only where that leads to no closed loops, by what the nearest miss leaves open.
@@ -168,7 +175,7 @@ def _size(rows):
 
 
 @eqx.filter_custom_jvp
-def close_loops(demand, q):
+def close_loops(demand: LoopClosure, q: Float[Array, " n_q"]) -> Float[Array, " n_q"]:
     """Find coordinates that close the loops, by a search from q."""
     return demand.search(q)
 

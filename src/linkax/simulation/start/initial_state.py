@@ -16,7 +16,7 @@ from linkax.formulations.projected_state import ranks_along
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 
 MOVES = 1e-6  # of the largest speed
 SINGULAR_ULPS = 8.0  # times the number of speeds: what rounding leaves of a singular mass matrix
@@ -52,12 +52,12 @@ class InitialCheck(NamedTuple):
         """Whether motion can start from here."""
         return self.finite & self.massive & self.closed & self.on_branch & self.unique
 
-    def of_numbers(self, sound) -> "InitialCheck":
+    def of_numbers(self, sound: Bool[Array, ""] | np.bool_) -> "InitialCheck":
         """Note whether the numbers of the mechanism are sound: what is wrong then."""
         return self._replace(finite=self.finite & sound, assembled=self.assembled | jnp.logical_not(sound))
 
 
-def check_initial_state(method: TangentSpace, system: System, t, state: State) -> InitialCheck:
+def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""], state: State) -> InitialCheck:
     """Close a state and find the rank of J beside it along the motion.
 
     At rest the motion departs along the acceleration. In a singular configuration that may take any direction that J
@@ -101,7 +101,7 @@ def check_initial_state(method: TangentSpace, system: System, t, state: State) -
     )
 
 
-def moving_joints(system: System, t, q, directions) -> list[str]:
+def moving_joints(system: System, t: Scalar, q: Float[Array, " n_q"], directions: Float[Array, "n_v k"]) -> list[str]:
     """Names of the joints, in the tree or cut, that move in some of the directions, (n_v, k)."""
     size = np.max(np.abs(directions), initial=0.0)
     configuration = configure(system, t, q)

@@ -4,35 +4,44 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
+from jaxtyping import Float, Int
 
+from linkax.equations.system import System
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve, invert
 from linkax.model.beams import BeamElasticity
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.static_scatter import scatter_static
 
 
-def rank_tolerance(dtype):
+def rank_tolerance(dtype: np.dtype) -> Float[Array, ""]:
     """τ of everything that is assembled."""
     return TangentSpace().prepared(dtype).tolerance
 
 
-def beams_of(system):
+def beams_of(system: System) -> list[BeamElasticity]:
     """The elastic forces of beams."""
     return [force for force in system.forces if isinstance(force, BeamElasticity)]
 
 
-def strains_of(system):
+def strains_of(system: System) -> Int[np.ndarray, " n_s"]:
     """Indices of the strains of beams among the speeds."""
     taken = [system.topology.speeds[beam.beam] for beam in beams_of(system)]
     return np.concatenate([np.zeros(0, int), *(np.arange(of.start, of.stop) for of in taken)])
 
 
-def elastic_energy(system):
+def elastic_energy(system: System) -> Float[Array, "n_s n_s"]:
     """The matrix of twice the energy of strains."""
     return block_diag(*(beam.matrix for beam in beams_of(system)))
 
 
-def nearest_solution(system, x, slopes, right, tolerance=None):
+def nearest_solution(
+    system: System,
+    x: Float[Array, " n_v"],
+    slopes: Float[Array, "m n_v"],
+    right: Float[Array, " m"],
+    tolerance: Scalar | None = None,
+) -> Float[Array, " n_v"]:
     """Solve slopes @ y = right for the y nearest to x, in radians and lengths of the mechanism.
 
     Strains of beams differ from x only in what all else leaves open, by as little energy as they can.
@@ -51,7 +60,14 @@ def nearest_solution(system, x, slopes, right, tolerance=None):
     return scatter_static(scatter_static(x, strains, strained), others, rest)
 
 
-def nearest_solution_in(metric, scales, x, slopes, right, tolerance=None):
+def nearest_solution_in(
+    metric: Float[Array, "n n"] | None,
+    scales: Float[Array, " n"],
+    x: Float[Array, " n"],
+    slopes: Float[Array, "m n"],
+    right: Float[Array, " m"],
+    tolerance: Scalar | None = None,
+) -> Float[Array, " n"]:
     """Solve slopes @ y = right for the y nearest to x in a metric; None: in scales."""
     tolerance = rank_tolerance(x.dtype) if tolerance is None else tolerance
     inverse = invert(metric, slopes, scales, tolerance)

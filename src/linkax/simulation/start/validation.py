@@ -1,23 +1,32 @@
 """Checks of what users give for a mechanism: numbers for joints, states, times."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import reduce
 from itertools import chain
 from operator import and_
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
+from linkax.equations.motion import Motion
 from linkax.model.functions import Law
+from linkax.model.joints.joint import AbstractJoint
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import is_finite, namespace, number, real, require, require_type
-from linkax.model.terms import Term, term
+from linkax.model.numbers import Number, Vector, is_finite, namespace, number, real, require, require_type
+from linkax.model.terms import Term, TermLike, term
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import concrete
+
+# What a user may give for joints, by their names, or by (name, index of a speed).
+JointNumbers = (
+    Mapping[str, Number | Vector] | Mapping[tuple[str, int], Number | Vector] | Mapping[TermLike, Number | Vector]
+)
+Tree = TypeVar("Tree")
 
 
 class JointValues(eqx.Module):
@@ -30,7 +39,7 @@ class JointValues(eqx.Module):
     terms: tuple[Term, ...] = eqx.field(static=True)
     values: tuple[Array, ...]
 
-    def speeds(self, motion) -> list[Array]:
+    def speeds(self, motion: Motion) -> list[Float[Array, " _"]]:
         """Read the speeds of these joints in a motion, in the shapes of `values`."""
         of_joint = lambda along: motion.joint_speeds(along.joint)
         return [of_joint(along) if along.index is None else of_joint(along)[along.index][None] for along in self.terms]
@@ -40,7 +49,7 @@ def _is_law(node) -> bool:
     return isinstance(node, Law)
 
 
-def check_mechanism(mechanism):
+def check_mechanism(mechanism: Mechanism) -> None:
     """Check that this is one mechanism, that its functions are unchanged, and that JAX is in double precision."""
     if not jax.config.read("jax_enable_x64"):
         raise ValueError(
@@ -65,7 +74,7 @@ def check_mechanism(mechanism):
         )
 
 
-def sound_numbers(mechanism) -> Bool[Array, ""] | np.bool_:
+def sound_numbers(mechanism: Mechanism) -> Bool[Array, ""] | np.bool_:
     """Whether all numbers of a mechanism that are or were traced are possible, see `linkax.model.numbers.require`.
 
     A user's own elements and functions are not looked at.
@@ -77,7 +86,7 @@ def sound_numbers(mechanism) -> Bool[Array, ""] | np.bool_:
     return reduce(and_, map(is_finite, filter(eqx.is_array, leaves)), np.True_)
 
 
-def marked(mechanism, found):
+def marked(mechanism: Mechanism, found: Tree) -> Tree:
     """Replace results of a mechanism by NaN where `sound_numbers` is false."""
     sound = sound_numbers(mechanism)
     if concrete(sound):
@@ -86,12 +95,12 @@ def marked(mechanism, found):
     return jax.tree.map(mark, found)
 
 
-def checked_time(entry, name: str):
+def checked_time(entry: Any, name: str) -> Float[Array, ""]:
     """Check one time [s]."""
     return number(entry, (), f"{name} [s]")
 
 
-def checked_state(mechanism, state) -> State:
+def checked_state(mechanism: Mechanism, state: State) -> State:
     """Check a state of a mechanism: floating-point numbers of the right shapes, finite where they are known."""
     check_mechanism(mechanism)
     topology, made = mechanism.topology, "make the state with linkax.assemble"
@@ -132,7 +141,9 @@ def _check_quaternion(coordinates, what):
         )
 
 
-def by_joint(mechanism: Mechanism, given, what: str, count) -> JointValues:
+def by_joint(
+    mechanism: Mechanism, given: Mapping[Any, Any] | None, what: str, count: Callable[[AbstractJoint], int]
+) -> JointValues:
     """Check numbers for joints, {joint or (joint, index): number or array}.
 
     **Arguments:** `count`: joint ↦ how many numbers it has.
@@ -158,7 +169,7 @@ def by_joint(mechanism: Mechanism, given, what: str, count) -> JointValues:
     return JointValues(tuple(terms), tuple(values))
 
 
-def coordinates_by_joint(mechanism: Mechanism, given, what: str) -> JointValues:
+def coordinates_by_joint(mechanism: Mechanism, given: Mapping[Any, Any] | None, what: str) -> JointValues:
     """Check coordinates of joints: quaternions whole and not zero."""
     found, values = by_joint(mechanism, given, what, lambda joint: joint.num_coordinates), []
     for along, entry in zip(found.terms, found.values, strict=True):
