@@ -5,8 +5,8 @@ from typing import Literal, get_args
 
 import equinox as eqx
 
-from linkax.formulations.tangent_space import TangentSpace
-from linkax.model.numbers import number, one_of, require
+from linkax.formulations.tangent_space import Metric, TangentSpace
+from linkax.model.numbers import Number, number, one_of, require
 from linkax.xla.arrays import Scalar
 
 Projection = Literal["both", "stage", "step", "none"]
@@ -38,7 +38,16 @@ class Accuracy(eqx.Module):
     projection: Projection = eqx.field(static=True)
     tangent_space: TangentSpace | None
 
-    def __init__(self, rtol=1e-8, atol=None, *, projection="both", rank_tolerance=None, clearance=1e-2, metric=None):
+    def __init__(
+        self,
+        rtol: Number = 1e-8,
+        atol: Number | None = None,
+        *,
+        projection: Projection = "both",
+        rank_tolerance: Number | None = None,
+        clearance: Number = 1e-2,
+        metric: Metric | None = None,
+    ) -> None:
         self.rtol = _number("rtol", rtol)
         self.atol = self.rtol if atol is None else _number("atol", atol)
         self.clearance = _number("clearance", clearance, zero=True)

@@ -4,6 +4,7 @@ import diffrax
 import jax.numpy as jnp
 
 from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import Number
 from linkax.xla.tracing import all_concrete
 
 CRITICAL = 2.0  # frequency times damping: waves that do not turn any more
@@ -11,7 +12,7 @@ LOOSE = 1e-5  # tolerance
 LONG = 2**15  # radians of the fastest wave: an explicit step takes 2 to 3, and a run 2**16 steps by default
 
 
-def default_solver(mechanism: Mechanism, rtol, duration) -> diffrax.AbstractSolver:
+def default_solver(mechanism: Mechanism, rtol: Number | None, duration: Number) -> diffrax.AbstractSolver:
     """Choose `Dopri8`, or for some mechanisms with beams `Kvaerno5`, implicit, whose steps fast waves do not choose.
 
     An implicit solver has to follow undamped waves that the motion excites as an explicit one does, with lower

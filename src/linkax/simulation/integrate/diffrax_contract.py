@@ -11,10 +11,13 @@ linkax tells a step control more: how close the stages of a step came to a singu
 
 from typing import Any, NamedTuple
 
+import diffrax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
 
+from linkax.model.topology import Topology
+from linkax.simulation.integrate.switches import Sides
 from linkax.xla.arrays import Array
 
 
@@ -44,31 +47,38 @@ class SolverState(NamedTuple):
     closest: Float[Array, ""]
 
 
-def pack(sides, q, v, integral):
+def pack(
+    sides: Sides, q: Float[Array, " n_q"], v: Float[Array, " n_v"], integral: Float[Array, ""] | float
+) -> Float[Array, " n"]:
     """The vector y that diffrax integrates: sides of switches, if any, q, v, and ∫ d dt; or its rates."""
-    first = [sides] if len(sides) else []
+    first: list[Any] = [sides] if len(sides) else []
     return jnp.concatenate([*first, q, v, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
 
 
-def unpack(topology, y):
+def unpack(
+    topology: Topology, y: Float[Array, "*batch n"]
+) -> tuple[Float[Array, "*batch k"], Float[Array, "*batch n_q"], Float[Array, "*batch n_v"]]:
     """Sides, q and v of vectors y, (..., k + n_q + n_v + 1)."""
     first = y.shape[-1] - topology.num_coordinates - topology.num_speeds - 1
     middle = first + topology.num_coordinates
     return y[..., :first], y[..., first:middle], y[..., middle:-1]
 
 
-def integral_of_distance(y):
+def integral_of_distance(y: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     """∫ d dt of a vector y."""
     return y[..., -1]
 
 
-def stage_distances(dense_info, duration, solver):
+def stage_distances(
+    dense_info: Any, duration: Float[Array, ""], solver: diffrax.AbstractSolver
+) -> Float[Array, " stages"] | None:
     """d at the stages of a Runge-Kutta step, whose increments `k` diffrax keeps to interpolate; None for others."""
     if not (isinstance(dense_info, dict) and "k" in dense_info and hasattr(solver, "tableau")):
         return None
     return lax.stop_gradient(dense_info["k"][:, -1] / duration)
 
 
-def closest(solution) -> Float[Array, ""]:
+def closest(solution: diffrax.Solution) -> Float[Array, ""]:
     """The smallest d at any stage of a diffrax solution that saved the solver's state."""
-    return solution.solver_state.closest
+    state: Any = solution.solver_state
+    return state.closest

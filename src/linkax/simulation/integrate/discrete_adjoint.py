@@ -62,14 +62,16 @@ class Found(NamedTuple):
     interpolation: Any
 
 
-def has_discrete_adjoint(solver, saveat, event, max_steps) -> bool:
+def has_discrete_adjoint(
+    solver: diffrax.AbstractSolver, saveat: diffrax.SaveAt, event: diffrax.Event | None, max_steps: int | None
+) -> bool:
     """Whether a run is differentiated here: explicit Runge-Kutta steps, saved states and no event."""
     plain = isinstance(saveat.subs, diffrax.SubSaveAt) and not saveat.subs.steps and not saveat.dense
     explicit = isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau)
     return plain and explicit and event is None and max_steps is not None
 
 
-def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bool):
+def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bool) -> tuple[Found, Steps | None]:
     """Solve an initial value problem; what derivatives there are, are those of diffrax's adjoint.
 
     **Returns:** a `Found`, and its `Steps` if they are to be tracked, else None.

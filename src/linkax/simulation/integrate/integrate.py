@@ -1,16 +1,19 @@
 """The compiled programs of a run: check its start, integrate, close what was saved."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from linkax.equations.system import system_of
+from linkax.formulations.formulation import AbstractFormulation
+from linkax.model.mechanism import Mechanism
+from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.discrete_adjoint import Found, Integrator, integrate, solve_by_diffrax
 from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.options import saved_times
@@ -43,7 +46,7 @@ def integrate_run(run: Run) -> Outcome:
     if concrete(sound := sound_numbers(run.mechanism)) is None:
         initial = initial.of_numbers(sound)
     found = _integrate.choose(run.quick, run, initial)(run, initial)
-    saveat = run.options.saveat
+    saveat: Any = run.options.saveat
     given = (found.ts, found.t_end), (found.ys, found.y_end), saves_states(saveat), _firsts(run)
     given = run.mechanism, run.formulation, run.accuracy, initial, *given
     return Outcome(initial, found, *_closed.choose(run.quick, *given)(*given))
@@ -55,7 +58,9 @@ def _check_start(mechanism, state, t0, tangent_space) -> InitialCheck:
     return check_initial_state(tangent_space.prepared(dtype), system_of(mechanism, dtype), t0, state)
 
 
-def problem_of(mechanism, formulation, accuracy, initial: InitialCheck) -> Problem:
+def problem_of(
+    mechanism: Mechanism, formulation: AbstractFormulation, accuracy: Accuracy, initial: InitialCheck
+) -> Problem:
     """The initial value problem's right-hand side from a state that was checked."""
     dtype = initial.state.q.dtype
     start = initial.can_start, initial.t, initial.singular
@@ -85,7 +90,9 @@ def _integrate(run: Run, initial: InitialCheck) -> Found:
     return _without_derivatives(found, event, inputs)
 
 
-def _in_order(t0, t1, dt0, saveat):
+def _in_order(
+    t0, t1, dt0, saveat
+) -> tuple[Bool[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""] | None, diffrax.SaveAt]:
     """Whether traced times make sense, and the times: where they do not, others, from which no step is taken.
 
     diffrax would raise from inside a program, and for all members of a batch.
@@ -107,7 +114,8 @@ class _OnManifold(eqx.Module):
 
     function: Callable
 
-    def __call__(self, t, y, args, **unused):  # diffrax passes `args` by name where it seeks the root of an event
+    # diffrax passes `args` by name where it seeks the root of an event.
+    def __call__(self, t: Float[Array, ""], y: Float[Array, " n"], args: Problem, **unused: Any) -> Any:
         return self.function(t, args.close(t, y), args.mechanism)
 
 

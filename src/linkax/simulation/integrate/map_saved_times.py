@@ -1,15 +1,20 @@
 """A map over saved times, of which many may never have been reached."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Bool, Float
 
+from linkax.xla.arrays import Array
 from linkax.xla.products_as_sums import with_products_as_sums
 
 ROWS = 16  # evaluated at a time: few share the price of one close to a singular configuration
 
 
-def map_saved_times(function, saved, *arrays):
+def map_saved_times(function: Callable[..., Any], saved: Bool[Array, " n"], *arrays: Float[Array, "n ..."]) -> Any:
     """Map a function over rows of arrays; NaN, zero or false where the row was not saved.
 
     The map goes in parts. A part of which nothing was saved costs nothing, and one close

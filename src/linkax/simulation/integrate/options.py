@@ -1,16 +1,21 @@
 """Checks of the options of a run, most of them diffrax's own objects, before anything is compiled."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from linkax.model.numbers import positive, real, require, require_type, whole_number
+from linkax.model.numbers import Number, positive, real, require, require_type, whole_number
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.step_control import MechanismControl
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
+
+Tree = TypeVar("Tree")
 
 # What each option is, and what to give.
 KINDS = {
@@ -24,7 +29,7 @@ KINDS = {
 FLOATS = ("float64", "float32")
 
 
-def check_kinds(**options):
+def check_kinds(**options: Any) -> None:
     """Check that options that are not None are diffrax's objects, not classes or numbers."""
     for name, entry in options.items():
         kind, example = KINDS[name]
@@ -36,7 +41,14 @@ def check_kinds(**options):
         )
 
 
-def check_steps(solver, controller, dt0, max_steps, t0, t1):
+def check_steps(
+    solver: diffrax.AbstractSolver,
+    controller: diffrax.AbstractStepSizeController,
+    dt0: Number | None,
+    max_steps: int | None,
+    t0: Float[Array, ""],
+    t1: Float[Array, ""],
+) -> Scalar | None:
     """Check that a solver and a step control fit each other and the run; return dt0 as an array, or None."""
     if solver.term_structure is not diffrax.AbstractTerm:
         kind = type(solver).__name__
@@ -60,19 +72,19 @@ def check_steps(solver, controller, dt0, max_steps, t0, t1):
     return positive(dt0, "dt0 [s]")
 
 
-def check_accuracy(accuracy):
+def check_accuracy(accuracy: Accuracy) -> None:
     """Check that this is a `linkax.Accuracy`."""
     presets = "give linkax.DRAFT, BALANCED, PRECISE or linkax.Accuracy(rtol=...)"
     require_type(accuracy, Accuracy, "accuracy", presets)
 
 
-def estimates_errors(solver) -> bool:
+def estimates_errors(solver: diffrax.AbstractSolver) -> bool:
     """Whether a solver estimates the error of its steps."""
     tableau = getattr(solver, "tableau", None)
     return isinstance(solver, diffrax.AbstractAdaptiveSolver) and (tableau is None or bool(np.any(tableau.b_error)))
 
 
-def traced_tolerances(controller):
+def traced_tolerances(controller: diffrax.AbstractStepSizeController) -> diffrax.AbstractStepSizeController:
     """Make arrays of tolerances given as Python floats, so that another value compiles nothing anew."""
     what = "stepsize_controller: a tolerance"
 
@@ -84,7 +96,9 @@ def traced_tolerances(controller):
     return with_tolerances(traced, controller)
 
 
-def check_saved_times(saveat, t0, t1, max_steps):
+def check_saved_times(
+    saveat: diffrax.SaveAt, t0: Float[Array, ""], t1: Float[Array, ""], max_steps: int | None
+) -> None:
     """Check that saved times are in order from t0 to t1 [s], and that saved steps have a largest number."""
     if max_steps is None and (saveat.dense or any(sub.steps for sub in _subs(saveat))):
         raise ValueError("max_steps is None, and saveat keeps all steps; give their largest number, such as 4096")
@@ -92,7 +106,7 @@ def check_saved_times(saveat, t0, t1, max_steps):
         _check_times(ts, "saveat: ts [s]", t0, t1)
 
 
-def saves_times(saveat) -> bool:
+def saves_times(saveat: diffrax.SaveAt | None) -> bool:
     """Whether states are saved at given times, and nothing else."""
     if jax.tree.structure(saveat) != jax.tree.structure(save_at(np.zeros(1))):
         return False
@@ -104,7 +118,7 @@ def save_at(ts: Any) -> diffrax.SaveAt:
     return diffrax.SaveAt(ts=ts)
 
 
-def saved_times(saveat) -> list:
+def saved_times(saveat: diffrax.SaveAt) -> list[Any]:
     """All arrays of times in a `SaveAt`."""
     return [sub.ts for sub in _subs(saveat) if sub.ts is not None]
 
@@ -125,7 +139,7 @@ def _check_times(ts, what, t0, t1):
     require(ts, right, what, f"give finite times in rising order, from t0 = {t0} s to t1 = {t1} s")
 
 
-def floating(dtype) -> np.dtype:
+def floating(dtype: Any) -> np.dtype:
     """Check the floating-point type of a run."""
     try:
         is_array = isinstance(dtype, jax.Array | np.ndarray | np.generic)
@@ -137,7 +151,7 @@ def floating(dtype) -> np.dtype:
     return jnp.dtype(found)
 
 
-def with_tolerances(change, tree):
+def with_tolerances(change: Callable[[Any], Any], tree: Tree) -> Tree:
     """Change all entries of a pytree that are named rtol or atol."""
     named = lambda path: path and getattr(path[-1], "name", None) in ("rtol", "atol")
     return jax.tree_util.tree_map_with_path(lambda path, leaf: change(leaf) if named(path) else leaf, tree)

@@ -1,6 +1,7 @@
 """A diffrax solver that puts the state back on the closed loops after each step."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax
@@ -9,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from linkax.model.numbers import Number
+from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import SolverState, StepError, stage_distances
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.step_control import MechanismControl
-from linkax.simulation.integrate.switches import crossed, meet
+from linkax.simulation.integrate.switches import Sides, crossed, meet
 from linkax.xla.arrays import Array
 from linkax.xla.one_kernel import in_one_kernel
 
@@ -23,7 +26,7 @@ STAGNATES = 0.9  # rate at which they no longer fall
 BEYOND = 1.5  # how far after its end a step may leave a passage, in steps
 
 
-def retry_factors(nodes) -> np.ndarray:
+def retry_factors(nodes: Float[Array, " n"]) -> Float[np.ndarray, " n"]:
     """The factors by which to change a step that meets an event at one of its nodes.
 
     For each node of a Runge-Kutta tableau in (0, 1] the factor that brings the event as far from
@@ -48,7 +51,7 @@ class StageNorm(eqx.Module):
     duration: Float[Array, ""]
     tolerances: tuple[Array, Array]
 
-    def __call__(self, change):
+    def __call__(self, change: Float[Array, " n"]) -> Float[Array, ""]:
         problem, (rtol, atol) = self.problem, self.tolerances
         scales, (of_q, of_v) = problem.system.scales, problem.errors(self.y0, self.duration * change)
         fastest = problem.system.fastest(problem.unpacked(self.y0)[1])
@@ -62,7 +65,9 @@ class Chord(diffrax.VeryChord):
     Up to version 0.7.2 diffrax's takes a step for failed where two iterations do not suffice.
     """
 
-    def terminate(self, fn, y, args, options, state, tags):
+    def terminate(
+        self, fn: Callable, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Stop where what later iterations would still change is below kappa, or where they diverge."""
         rate, at_least_two = state.diffsize / state.diffsize_prev, state.step >= 2
         contracts = at_least_two & (rate < 1.0)
@@ -97,7 +102,9 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
     term_structure: ClassVar = diffrax.AbstractTerm
 
     @staticmethod
-    def around(solver, accuracy, adjoint, control: MechanismControl) -> "ProjectedSolver":
+    def around(
+        solver: diffrax.AbstractSolver, accuracy: Accuracy, adjoint: diffrax.AbstractAdjoint, control: MechanismControl
+    ) -> "ProjectedSolver":
         """Wrap a solver.
 
         diffrax hands a solver two things only where it sees it, so it gets them here: the kind of loop inside
@@ -124,31 +131,42 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         return dataclasses.replace(self.solver, root_finder=dataclasses.replace(finder, rtol=0.0, atol=1.0, norm=norm))
 
     @property
-    def interpolation_cls(self):
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:
         return self.solver.interpolation_cls
 
     @property
-    def term_compatible_contr_kwargs(self):
+    def term_compatible_contr_kwargs(self) -> Any:
         return self.solver.term_compatible_contr_kwargs
 
-    def order(self, terms):
+    def order(self, terms: Any) -> int | None:
         return self.solver.order(terms)
 
-    def error_order(self, terms):
+    def error_order(self, terms: Any) -> Number | None:
         return self.solver.error_order(terms)
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(
+        self, terms: Any, t0: Float[Array, ""], t1: Float[Array, ""], y0: Float[Array, " n"], args: Problem
+    ) -> SolverState:
         one = jnp.ones((), args.system.dtype)
         return SolverState(self.solver.init(terms, t0, t1, y0, args), one, one)
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: Any, t0: Float[Array, ""], y0: Float[Array, " n"], args: Problem) -> Float[Array, " n"]:
         return self.solver.func(terms, t0, y0, args)
 
     @in_one_kernel(
         when=lambda self, *_: self.is_undifferentiated,
         sound=lambda self, terms, t0, t1, y0, *_: jnp.all(jnp.isfinite(y0)),
     )
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: Any,
+        t0: Float[Array, ""],
+        t1: Float[Array, ""],
+        y0: Float[Array, " n"],
+        args: Problem,
+        solver_state: SolverState,
+        made_jump: Bool[Array, ""] | bool,
+    ) -> tuple[Float[Array, " n"], StepError, dict[str, Any], SolverState, diffrax.RESULTS]:
         """Take a step with the solver inside and correct it; its error and state are those of `diffrax_contract`."""
         # Solvers that begin with the last derivative of the step before must not where the state has moved since.
         switching = len(args.sides(y0)) > 0
@@ -178,6 +196,8 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         state = SolverState(inner, arrives, closest)
         return y1, StepError(error, leaves, passes, retry, switch), dense_info, state, result
 
-    def corrected(self, problem: Problem, t1, y1, sides):
+    def corrected(
+        self, problem: Problem, t1: Float[Array, ""], y1: Float[Array, " n"], sides: Sides
+    ) -> Float[Array, " n"]:
         """Correct the state after a step, and put it on these sides of switches."""
         return crossed(problem, t1, problem.corrected(t1, y1)[0] if self.after_step else y1, sides)

@@ -1,9 +1,13 @@
 """How a run ended, in names and words; its errors and warnings."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 
 from linkax.xla.enumerations import code
+
+Solution = Any  # a `linkax.Solution`, of a higher layer
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  Equinox lets enumerations be extended
@@ -62,7 +66,7 @@ KNOWN_RESULTS = (
 ENDED_WELL = ("successful", "event_occurred")
 
 
-def result_name(result) -> str:
+def result_name(result: RESULTS) -> str:
     """The name of a result, such as "successful" or "max_steps_reached"."""
     for name in KNOWN_RESULTS:
         if bool(result == getattr(RESULTS, name)):
@@ -70,7 +74,7 @@ def result_name(result) -> str:
     return "failed"
 
 
-def remark_name(remark) -> str:
+def remark_name(remark: "REMARKS") -> str:
     """The name of a remark, such as "none" or "stiff"."""
     return next((name for name in WARNINGS if code(remark) == code(getattr(REMARKS, name))), "none")
 
@@ -116,6 +120,7 @@ WARNINGS = {
 class SimulationError(RuntimeError):
     """A run did not reach its end; `solution` holds the part computed."""
 
-    def __init__(self, message, solution=None):  # the message alone is what pickle gives, the rest follows
+    # The message alone is what pickle gives, the rest follows.
+    def __init__(self, message: str, solution: Solution | None = None) -> None:
         super().__init__(message)
         self.solution = solution

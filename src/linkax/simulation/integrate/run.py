@@ -1,7 +1,7 @@
 """A run: what is to be integrated, how, and what is saved of it, checked once and carried whole."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -15,7 +15,7 @@ from linkax.formulations.named import formulation as named_formulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.functions import Function
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import require_bool, require_type
+from linkax.model.numbers import Number, require_bool, require_type
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.discrete_adjoint import has_discrete_adjoint
@@ -32,13 +32,14 @@ from linkax.simulation.integrate.options import (
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import all_concrete, concrete
 
 DEFAULT_FORMULATION = TangentSpace()
 DEFAULT_MAX_STEPS = 16**4
 DEFAULT_SAVES = 201
 SAVE_STATE = diffrax.SubSaveAt(t1=True).fn
+Tree = TypeVar("Tree")
 
 
 class DiffraxOptions(NamedTuple):
@@ -61,7 +62,7 @@ class _Frozen(eqx.Module):
     rest: Any = eqx.field(static=True)
 
     @staticmethod
-    def of(tree) -> "_Frozen":
+    def of(tree: Any) -> "_Frozen":
         return _Frozen(*eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array | np.ndarray | np.generic)))
 
 
@@ -84,7 +85,18 @@ class Run(eqx.Module):
     _options: DiffraxOptions | _Frozen | None
 
     @staticmethod
-    def of(mechanism, state, *, t0, t1, accuracy, formulation, dtype, optimise, **given) -> "Run":
+    def of(
+        mechanism: Mechanism,
+        state: State,
+        *,
+        t0: Number,
+        t1: Number,
+        accuracy: Accuracy,
+        formulation: str | AbstractFormulation | None,
+        dtype: Any,
+        optimise: bool,
+        **given: Any,
+    ) -> "Run":
         """Check all options of `linkax.simulate`, and fill in those that are None.
 
         **Raises:** `ValueError` for the first one that is wrong.
@@ -103,7 +115,9 @@ class Run(eqx.Module):
         return Run(mechanism, state, t0, t1, formulation, accuracy, optimise, saves, options)
 
     @staticmethod
-    def of_state(mechanism, state, t, formulation, accuracy) -> "Run":
+    def of_state(
+        mechanism: Mechanism, state: State, t: Scalar | float, formulation: AbstractFormulation, accuracy: Accuracy
+    ) -> "Run":
         """What a state alone says of a run: nothing is stepped."""
         return Run(mechanism, state, t, t, formulation, accuracy, True, False, None)
 
@@ -148,7 +162,7 @@ class Run(eqx.Module):
         """What measures ranks and distances from singular configurations: the formulation, or the paper's."""
         return self.formulation if isinstance(self.formulation, TangentSpace) else DEFAULT_FORMULATION
 
-    def changed(self, **changes) -> "Run":
+    def changed(self, **changes: Any) -> "Run":
         """The same run with other fields, or other objects of diffrax."""
         options = {name: changes.pop(name) for name in DiffraxOptions._fields if name in changes}
         if "saveat" in options:
@@ -161,7 +175,9 @@ class Run(eqx.Module):
         return dataclasses.replace(self, _options=_Frozen.of(DiffraxOptions(dt0, solver, controller, max_steps)))
 
 
-def checked_formulation(formulation, accuracy: Accuracy | None = None) -> AbstractFormulation:
+def checked_formulation(
+    formulation: str | AbstractFormulation | None, accuracy: Accuracy | None = None
+) -> AbstractFormulation:
     """A formulation from its name, or itself; None for the paper's."""
     if isinstance(formulation, str):
         formulation = named_formulation(formulation)
@@ -189,12 +205,12 @@ def _filled_in(mechanism, accuracy, t0, t1, *, solver, stepsize_controller, dt0,
     return DiffraxOptions(dt0, solver, traced_tolerances(stepsize_controller), max_steps, saveat, **others)
 
 
-def saves_states(saveat) -> bool:
+def saves_states(saveat: diffrax.SaveAt) -> bool:
     """Whether states are saved, and not functions of them."""
     return isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs.fn is SAVE_STATE
 
 
-def cast(tree, dtype):
+def cast(tree: Tree, dtype: np.dtype) -> Tree:
     """A pytree with its numbers in a floating-point type."""
     real = lambda leaf: isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating)
     return jax.tree.map(lambda leaf: leaf.astype(dtype) if real(leaf) and leaf.dtype != dtype else leaf, tree)

@@ -1,7 +1,7 @@
 """The classical Runge-Kutta method, which diffrax does not have."""
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import numpy as np
@@ -21,9 +21,9 @@ class RungeKutta4(diffrax.AbstractERK):
     )
     interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
-    def order(self, terms):
+    def order(self, terms: Any) -> int:
         return 4
 
-    def step(self, *arguments):
+    def step(self, *arguments: Any) -> tuple[Any, None, Any, Any, diffrax.RESULTS]:
         y1, _, dense_info, state, result = super().step(*arguments)
         return y1, None, dense_info, state, result

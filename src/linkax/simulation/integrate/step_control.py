@@ -7,7 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Bool, Float, Int
 
+from linkax.simulation.integrate.diffrax_contract import StepError
+from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.one_kernel import in_one_kernel
 
@@ -42,7 +45,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     controller: diffrax.AbstractStepSizeController
     is_undifferentiated: bool = eqx.field(static=True, default=False)
 
-    def wrap(self, direction):
+    def wrap(self, direction: int | Array) -> "MechanismControl":
         return MechanismControl(self.controller.wrap(direction), self.is_undifferentiated)
 
     @property
@@ -50,7 +53,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         """Whether the controller inside chooses the steps by their errors."""
         return isinstance(self.innermost, diffrax.AbstractAdaptiveStepSizeController)
 
-    def tolerances(self, otherwise):
+    def tolerances(self, otherwise: tuple[Any, Any]) -> tuple[Any, Any]:
         """Relative and absolute tolerance of the controller inside; `otherwise` where it has none."""
         inner = self.innermost
         return (inner.rtol, inner.atol) if self.is_adaptive else otherwise
@@ -63,7 +66,17 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             inner = inner.controller
         return inner
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+    def init(
+        self,
+        terms: Any,
+        t0: Float[Array, ""],
+        t1: Float[Array, ""],
+        y0: Float[Array, " n"],
+        dt0: Float[Array, ""] | None,
+        args: Any,
+        func: Any,
+        error_order: Any,
+    ) -> tuple[Any, tuple[Any, Int[Array, ""]]]:
         _, v = args.unpacked(y0)
         if dt0 is None and self.is_adaptive:
             # Not diffrax's choice, which would compile the equations of motion twice more.
@@ -75,7 +88,17 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         return first, (state, jnp.zeros((), int))
 
     @in_one_kernel(when=lambda self, *_: self.is_undifferentiated, sound=lambda self, t0, *_: jnp.isfinite(t0))
-    def adapt_step_size(self, t0: Any, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
+    def adapt_step_size(
+        self,
+        t0: Float[Array, ""],
+        t1: Float[Array, ""],
+        y0: Float[Array, " n"],
+        y1_candidate: Float[Array, " n"],
+        args: Any,
+        y_error: StepError,
+        error_order: Any,
+        controller_state: tuple[Any, Int[Array, ""]],
+    ) -> tuple[Bool[Array, ""], Float[Array, ""], Any, Any, tuple[Any, Int[Array, ""]], diffrax.RESULTS]:
         """Accept or reject the step, and choose the next one; `y_error` is a `StepError`."""
         scales = args.system.scales
         magnitude, candidate = (_magnitudes(args, y) for y in (y0, y1_candidate))

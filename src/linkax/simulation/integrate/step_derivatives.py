@@ -57,7 +57,7 @@ class Tableau(NamedTuple):
     nodes: np.ndarray
 
     @staticmethod
-    def of(solver) -> "Tableau":
+    def of(solver: Any) -> "Tableau":
         tableau = solver.tableau
         weights = np.zeros((tableau.num_stages, tableau.num_stages))
         for row, entries in enumerate(tableau.a_lower):
@@ -133,9 +133,12 @@ def _within(solver: ProjectedSolver, t0, t1, dense, t):
     return solver.interpolation_cls(t0=t0, t1=t1, **dense).evaluate(t)
 
 
-def tangents_over_steps(solver, every, ivp, steps, tangents: InitialValueProblem) -> Trajectory:
+def tangents_over_steps(
+    solver: ProjectedSolver, every: bool, ivp: InitialValueProblem, steps: Steps, tangents: InitialValueProblem
+) -> Trajectory:
     """JVP of a run, step by step from the first: tangents of its states; None among `tangents` is zero."""
-    y0, last = ivp.y0, steps.count - 1
+    y0, count = ivp.y0, cast(Any, steps.count)
+    last = count - 1
     saves, saved = ivp.saved is not None, cast(Any, ivp.saved)
     saved_dot = cast(Any, materialise(saved, tangents.saved) if saves else None)
 
@@ -168,7 +171,7 @@ def tangents_over_steps(solver, every, ivp, steps, tangents: InitialValueProblem
         steps=jnp.zeros_like(steps.ys).at[0].set(materialise(y0, tangents.y0)) if every else None,
     )
     begin = jnp.zeros((), int), jnp.zeros((), int), y0, motion
-    return lax.while_loop(lambda carry: carry[0] < steps.count, with_products_as_sums(one), begin)[-1]
+    return lax.while_loop(lambda carry: carry[0] < count, with_products_as_sums(one), begin)[-1]
 
 
 def _reached(saved, j, t):
@@ -176,10 +179,12 @@ def _reached(saved, j, t):
     return (j < len(saved)) & (saved[jnp.minimum(j, len(saved) - 1)] <= t)
 
 
-def cotangents_over_steps(solver, ivp, steps, wanted, cotangent: Trajectory) -> InitialValueProblem:
+def cotangents_over_steps(
+    solver: ProjectedSolver, ivp: InitialValueProblem, steps: Steps, wanted: InitialValueProblem, cotangent: Trajectory
+) -> InitialValueProblem:
     """VJP of a run, step by step from the last: cotangents of the leaves of `ivp` that are `wanted`."""
     problem, fixed = eqx.partition(ivp.problem, wanted.problem)
-    last = steps.count - 1
+    last = cast(Any, steps.count) - 1
     saved = cast(Any, ivp.saved)
     saved_cotangent: Any = cotangent.saved
 

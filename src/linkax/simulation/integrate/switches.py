@@ -5,16 +5,21 @@ A step that goes past a switch is tried again, up to there, and the next begins 
 """
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Float
 
 from linkax.equations.configuration import configure
-from linkax.equations.motion import move
-from linkax.model.forces import AbstractForce, has_switch
+from linkax.equations.motion import Motion, move
+from linkax.equations.system import System
+from linkax.model.elements import Time
+from linkax.model.forces import AbstractForce, Load, has_switch
 from linkax.xla.arrays import Array
 
 SAMPLES = 8  # of a step: between two of them a force element must not switch twice
@@ -23,6 +28,9 @@ TIME_ULPS = 8.0
 SHORTEN = 1e-3  # a step that begins past a switch
 ITERATIONS = 60
 
+Sides = Float[Array, " m"] | tuple[()]  # of all switches, 1 or −1; () without switches
+Problem = Any  # that of `linkax.simulation.integrate.problem`, which imports this module
+
 
 class Held(eqx.Module):
     """A force element held on one side of its switch."""
@@ -30,31 +38,38 @@ class Held(eqx.Module):
     force: AbstractForce
     side: Array
 
-    def applied(self, t, motion):
+    def applied(self, t: Time, motion: Motion) -> Load:
         return self.force.applied(t, motion, self.side > 0.0)
 
 
-def held(system, sides):
+def held(system: System, sides: Sides) -> System:
     """Hold the force elements of a system on the given sides of their switches, (m,), 1 or −1."""
-    sides = iter(sides)
-    forces = tuple(Held(force, next(sides)) if has_switch(force) else force for force in system.forces)
+    each = iter(sides)
+    forces = tuple(Held(force, next(each)) if has_switch(force) else force for force in system.forces)
     return dataclasses.replace(system, forces=forces)
 
 
-def values(system, t, q, v):
+def values(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Float[Array, " m"]:
     """Values of all switches of force elements, (m,)."""
     motion = move(configure(system, t, q), v)
     return jnp.stack([force.switched(t, motion) for force in system.forces if has_switch(force)])
 
 
-def start_sides(system, t, q, v):
+def start_sides(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Sides:
     """The sides of switches, (m,), 1 or −1, at a state; () without switches."""
     if not any(map(has_switch, system.forces)):
         return ()
     return jnp.where(values(system, t, q, v) > 0.0, 1.0, -1.0).astype(q.dtype)
 
 
-def meet(problem, t0, t1, y0, y1, within):
+def meet(
+    problem: Problem,
+    t0: Float[Array, ""],
+    t1: Float[Array, ""],
+    y0: Float[Array, " n"],
+    y1: Float[Array, " n"],
+    within: Callable[[Float[Array, ""]], Float[Array, " n"]],
+) -> tuple[Float[Array, ""], Float[Array, " m"]]:
     """Find where a step goes past a switch, and on which sides it ends.
 
     **Arguments:** `within(t)`: interpolates in the step.
@@ -91,7 +106,7 @@ def meet(problem, t0, t1, y0, y1, within):
     return jnp.where(resolved, jnp.maximum(share, SHORTEN), 1.0), jnp.where(arrives, -sides, sides)
 
 
-def crossed(problem, t, y, sides):
+def crossed(problem: Problem, t: Float[Array, ""], y: Float[Array, " n"], sides: Sides) -> Float[Array, " n"]:
     """Put a state on the sides of switches that it goes over to, with the derivative of when it does.
 
     Where forces jump, a later crossing changes the motion after it: (f₋ − f₊) dt, with dt = −dg / ġ for a
