@@ -4,19 +4,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from linkax.equations.configuration import configure
 from linkax.equations.dynamics import mass_matrix
 from linkax.equations.gaps import gaps
 from linkax.equations.loops import jacobian, residual
 from linkax.equations.motion import move
-from linkax.equations.system import system_of
+from linkax.equations.system import System, system_of
 from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.constraint_split import ConstraintSplit
+from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import invert
 from linkax.model.constraints import Drive
-from linkax.simulation.integrate.results import RESULTS
+from linkax.simulation.integrate.results import RESULTS, Solution
 from linkax.simulation.start.initial_state import MOVES, moving_joints
+from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
 
 AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
@@ -25,7 +28,7 @@ LOST = 1e-9  # of an inertia: what is below leaves too few digits of double prec
 NULL = 1e-10  # eigenvalue of a mass matrix of ones
 
 
-def cause(solution) -> str:
+def cause(solution: Solution) -> str:
     """Name the elements at fault in a sentence; an empty string where none is found.
 
     **Arguments:** `solution`: of a run that failed.
@@ -151,7 +154,7 @@ def _widest(system, mechanism, t, q):
     return names[widest], float(sizes[widest])
 
 
-def lost_inertia(system, below=LOST):
+def lost_inertia(system: System, below: float = LOST) -> str:
     """Name a body whose inertia about its joint rounding loses, next to that of a body it carries far out."""
     topology, carrier = system.topology, np.array(system.topology.predecessor)
     offsets = np.stack([system.parent_offset, system.child_offset], axis=1)[: topology.num_bodies]
@@ -178,7 +181,7 @@ def lost_inertia(system, below=LOST):
     )
 
 
-def massless_bodies(system, method, t, q):
+def massless_bodies(system: System, method: TangentSpace, t: Scalar, q: Float[Array, " n_q"]) -> list[str]:
     """Names of bodies that can move without moving any mass; magnitudes do not matter, so all masses are set to one."""
     moment = jnp.max(jnp.abs(system.inertia), axis=(1, 2))
     inertia = ratio(system.inertia, moment[:, None, None], 0.0) * system.length**2

@@ -3,18 +3,21 @@
 import diffrax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.options import save_at, with_tolerances
+from linkax.simulation.integrate.results import Solution
 from linkax.simulation.integrate.run import DEFAULT_SAVES, Run, cast
 from linkax.simulation.start.state import State
+from linkax.xla.arrays import Array
 
 FINEST = 1e-13  # tolerance
 REFINED_STEPS = 4  # as many as in the run before
 FEWEST = 51  # saved times, with fewer of which a part is saved at the default ones
 
 
-def refined_run(solution, factor) -> Run:
+def refined_run(solution: Solution, factor: Float[Array, ""]) -> Run:
     """The run of a solution in double precision, at `factor` times its tolerances, or at half its steps.
 
     **Raises:** `ValueError` for steps that cannot be refined.
@@ -37,7 +40,7 @@ def refined_run(solution, factor) -> Run:
     )
 
 
-def part_of_run(solution, state: State, ts) -> Run:
+def part_of_run(solution: Solution, state: State, ts: Float[np.ndarray, " n"]) -> Run:
     """The motion from a state at the first of some times to the last, saved there, in double precision.
 
     By the same program where the run of the solution saves as many.
@@ -53,12 +56,12 @@ def _in_double(run: Run, state: State, accuracy: Accuracy) -> Run:
     return run.changed(mechanism=mechanism, state=state, t0=t0, accuracy=accuracy)
 
 
-def num_saves(solution) -> int:
+def num_saves(solution: Solution) -> int:
     """States that a part of a run saves at most."""
     return len(solution.ts) if solution.run.saves_times and len(solution.ts) >= FEWEST else DEFAULT_SAVES
 
 
-def has_parts(solution) -> bool:
+def has_parts(solution: Solution) -> bool:
     """Whether a part of the motion can be run by itself: not where steps are given, nor for a single state."""
     run = solution.run
     return run.is_integrated and not isinstance(run.control.innermost, diffrax.StepTo)

@@ -15,7 +15,7 @@ from linkax.equations.system import system_of
 from linkax.linalg.spectral_radius import spectral_radius
 from linkax.linalg.triangular import cholesky_inverse
 from linkax.simulation.explain.diagnosis import lost_inertia
-from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS
+from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS, Solution
 from linkax.xla.enumerations import code, item
 from linkax.xla.tracing import all_concrete, quick_compile
 
@@ -31,7 +31,7 @@ FAST = 0.5  # rate of an element that chooses the steps, times their mean length
 RESOLVED = 5.0  # the same, below which an explicit solver takes about as many steps: Dopri8's reach 2 to 3
 
 
-def remark(solution) -> Any:
+def remark(solution: Solution) -> Any:
     """The first of `REMARKS` that applies to a run that ended well, or to each of a batch."""
     known, found = _known(solution), np.zeros(solution.t_end.shape, np.int32)
     numeric = np if known is np.asarray else jnp
@@ -43,7 +43,7 @@ def remark(solution) -> Any:
     return item(jnp.asarray(found, jnp.int32) if found.shape else found, REMARKS)
 
 
-def in_words(solution, *names) -> str:
+def in_words(solution: Solution, *names: str) -> str:
     """Explain the first of these `REMARKS` that applies to a run, ended well or not, with numbers and elements; or
     nothing.
     """
