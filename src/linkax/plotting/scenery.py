@@ -11,12 +11,10 @@ from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.mechanism import Mechanism
 from linkax.model.ropes import ElasticRope, Rope
-from linkax.simulation.read.solution import Solution
+from linkax.simulation.read.solution import Place, Solution
 
 NEGLIGIBLE = 1e-9  # length in the picture up to which a direction is seen from its end
-# A point of a body: a frame, a position on it, or None for its centre of mass, see `Solution.position`.
-Place = str | ArrayLike | Sequence[float] | None
-Points = Mapping[str, tuple[str, Place]]
+Points = Mapping[str, tuple[str, Place]]  # {name of a point: its body, and where on it}
 
 
 class Scenery(NamedTuple):

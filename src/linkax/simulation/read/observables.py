@@ -1,24 +1,26 @@
 """What can be read from a motion at one time; `linkax.Solution` reads it at all its times."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from linkax.equations.configuration import along_speeds, beam_point, configure
+from linkax.equations.configuration import Configuration, along_speeds, beam_point, configure
 from linkax.equations.coordinates import rates
 from linkax.equations.dynamics import applied_load, body_accelerations, kinetic_energy, potential_energy
 from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
-from linkax.equations.motion import move
-from linkax.equations.reactions import Reaction, reactions, reactions_to, seen_from
+from linkax.equations.motion import Motion, move
+from linkax.equations.reactions import Axes, Reaction, Side, reactions, reactions_to, seen_from
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.least_multipliers import LeastMultipliers, least_multipliers
+from linkax.model.beams import Beam
 from linkax.spatial.rotations import rotate
 from linkax.spatial.vectors import cross, largest
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, Scalar
 
 UNCHANGED = 1e-6  # by a self-stress of magnitude one
 
@@ -69,11 +71,11 @@ class Observables(NamedTuple):
     dynamics: Dynamics | None = None
 
     @property
-    def configuration(self):
+    def configuration(self) -> Configuration:
         return configure(self.system, self.t, self.q)
 
     @property
-    def motion(self):
+    def motion(self) -> Motion:
         return move(self.configuration, self.v)
 
     @property
@@ -85,28 +87,28 @@ class Observables(NamedTuple):
     def solve(self) -> Dynamics:
         return self.method.dynamics(self.system, self.t, self.q, self.v)
 
-    def position(self, body, point):
+    def position(self, body: Int[Array, "*bodies"], point: Float[Array, "3"]) -> Float[Array, "*bodies 3"]:
         configuration = self.configuration
         return configuration.world_position()[body] + _arm(configuration, body, point)
 
-    def velocity(self, body, point):
+    def velocity(self, body: Int[Array, "*bodies"], point: Float[Array, "3"]) -> Float[Array, "*bodies 3"]:
         motion = self.motion
         arm = _arm(motion.configuration, body, point)
         return motion.velocity[body] + cross(motion.angular_velocity[body], arm)
 
-    def acceleration(self, body, point):
+    def acceleration(self, body: Int[Array, "*bodies"], point: Float[Array, "3"]) -> Float[Array, "*bodies 3"]:
         motion = self.motion
         arm, omega = _arm(motion.configuration, body, point), motion.angular_velocity[body]
         angular, linear = body_accelerations(motion, self.solved.acceleration)
         return linear[body] + cross(angular[body], arm) + cross(omega, cross(omega, arm))
 
-    def center_of_mass(self, function, bodies):
+    def center_of_mass(self, function: Callable[..., Any], bodies: Int[Array, " n"]) -> Float[Array, "3"]:
         """Apply `position`, `velocity` or `acceleration` to the common centre of mass of several bodies."""
         of_bodies = function(self, bodies, jnp.zeros(3, self.q.dtype))
         mass = self.system.mass[bodies]
         return mass @ of_bodies / jnp.sum(mass)
 
-    def on_beam(self, function, beam, point):
+    def on_beam(self, function: Callable[..., Any], beam: Beam, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """Apply the same to a point fixed to the section of a beam at point[0]."""
         place = lambda t, q: beam_point(configure(self.system, t, q), beam, point)
         if function is Observables.position:
@@ -117,20 +119,20 @@ class Observables(NamedTuple):
         changes = jnp.ones_like(self.t), rates(self.system.topology, self.q, self.v), self.solved.acceleration
         return jax.jvp(moving, (self.t, self.q, self.v), changes)[1]
 
-    def poses(self):
+    def poses(self) -> Pose:
         configuration = self.configuration
         return Pose(configuration.world_position(), configuration.rotation[: self.system.topology.num_bodies])
 
-    def orientation(self, body):
+    def orientation(self, body: Int[Array, ""]) -> Float[Array, "3 3"]:
         return self.configuration.rotation[body]
 
-    def angular_velocity(self, body):
+    def angular_velocity(self, body: Int[Array, ""]) -> Float[Array, "3"]:
         return self.motion.angular_velocity[body]
 
-    def joint(self, name):
+    def joint(self, name: str) -> Float[Array, " n"]:
         return self.configuration.joint_coordinates(name)
 
-    def joint_speed(self, name):
+    def joint_speed(self, name: str) -> Float[Array, " n"]:
         return self.motion.joint_speeds(name)
 
     def _least_multipliers(self):
@@ -147,11 +149,11 @@ class Observables(NamedTuple):
             return self.method.least_multipliers(self.system, self.t, self.q, self.v)
         return self._least_multipliers().multipliers
 
-    def reactions(self, on, axes):
+    def reactions(self, on: Side, axes: Axes) -> Reaction:
         found = reactions(self.motion, self.solved.acceleration, self._multipliers())
         return seen_from(self.configuration, found, on, axes)
 
-    def constraint_forces(self):
+    def constraint_forces(self) -> Float[Array, " k"]:
         return sorted_multipliers(self.configuration, self._multipliers()).constraints
 
     def _self_stresses(self):
@@ -164,7 +166,7 @@ class Observables(NamedTuple):
         stresses = stresses.at[len(free) :, len(free) :].set(jnp.eye(immobile))
         return jnp.split(stresses, [len(free)], axis=1)
 
-    def unique(self, on, axes):
+    def unique(self, on: Side, axes: Axes) -> Reaction:
         configuration = self.configuration
 
         def changes(multipliers, immobile):
@@ -175,18 +177,18 @@ class Observables(NamedTuple):
         still = lambda change: jnp.max(jnp.abs(change), axis=0, initial=0.0) <= UNCHANGED
         return Reaction(still(force * self.system.length), still(moment))
 
-    def unique_constraint_forces(self):
+    def unique_constraint_forces(self) -> Bool[Array, " k"]:
         topology = self.system.topology
         rows = self._self_stresses()[0][:, topology.num_rows - len(topology.constraints) :]
         return jnp.max(jnp.abs(rows), axis=0, initial=0.0) <= UNCHANGED
 
-    def kinetic_energy(self):
+    def kinetic_energy(self) -> Float[Array, ""]:
         return kinetic_energy(self.motion)
 
-    def potential_energy(self):
+    def potential_energy(self) -> Scalar:
         return potential_energy(self.configuration)
 
-    def power(self):
+    def power(self) -> Power:
         motion, configuration = self.motion, self.configuration
         load = applied_load(motion)
         force = load.joint_force + along_speeds(configuration, load.force, load.moment)
@@ -194,7 +196,7 @@ class Observables(NamedTuple):
         _, rise = jax.jvp(energy, (self.q,), (rates(self.system.topology, self.q, self.v),))
         return Power(force @ self.v + rise, self.solved.multipliers @ rate(self.system, self.t))
 
-    def violation_and_scales(self):
+    def violation_and_scales(self) -> tuple[Violation, Float[Array, ""], Float[Array, ""]]:
         """The violation, and the largest speed and acceleration of the joints [1/s, 1/s²]."""
         configuration = self.configuration
         position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
@@ -203,10 +205,10 @@ class Observables(NamedTuple):
         speed = self.system.fastest(self.v)
         return violation, speed, jnp.maximum(self.system.fastest(self.solved.acceleration), speed**2)
 
-    def rank(self):
+    def rank(self) -> Int[Array, ""]:
         return jnp.sum(self.tangent_space.constraint_split(self.system, self.t, self.q).inverse.rank)
 
-    def distance(self):
+    def distance(self) -> Float[Array, ""]:
         return self.tangent_space.distance(self.system, self.t, self.q)
 
 

@@ -2,19 +2,23 @@
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from diffrax import ThirdOrderHermitePolynomialInterpolation
+from jaxtyping import Float, Inexact, Int
 
 from linkax.equations.coordinates import on_manifold, rates, speeds
-from linkax.equations.system import system_of
+from linkax.equations.system import System, system_of
 from linkax.formulations.classical import ClassicalFormulation
+from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.mechanism import Mechanism
 from linkax.simulation.explain.error_estimate import has_parts, num_saves, part_of_run
-from linkax.simulation.integrate.results import ENDED_WELL, result_name
+from linkax.simulation.integrate.results import ENDED_WELL, Solution, result_name
 from linkax.simulation.start.state import State
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import quick_compile
 
 REFINEMENTS = 6
@@ -54,19 +58,19 @@ class Samples(NamedTuple):
     distances: np.ndarray
 
     @staticmethod
-    def of(solution) -> "Samples":
+    def of(solution: Solution) -> "Samples":
         reached = np.isfinite(np.asarray(solution.ts))
         parts = solution.ts, solution.q, solution.v, solution.singularity_distance()
         return Samples(*(np.asarray(part)[reached] for part in parts))
 
-    def taken(self, which) -> "Samples":
+    def taken(self, which: np.ndarray | np.integer) -> "Samples":
         return Samples(*(part[which] for part in self))
 
     def then(self, other: "Samples") -> "Samples":
         """Join samples of which the second begin with the last state of the first."""
         return Samples(*(np.concatenate([part, more[1:]]) for part, more in zip(self, other, strict=True)))
 
-    def missed(self, system) -> np.ndarray:
+    def missed(self, system: System) -> Float[np.ndarray, " intervals"]:
         """The largest error of a cubic polynomial in each interval, as a time [s], (n - 1,).
 
         The polynomial over two intervals misses the state in their middle by sixteen times as much.
@@ -82,7 +86,7 @@ class Samples(NamedTuple):
         missed[1:-1] = size(off) / 16.0 / np.maximum(size(self.v[1:-1]), np.finfo(float).tiny)
         return np.where(np.isfinite(missed[1:]), np.maximum(missed[:-1], missed[1:]), np.inf)
 
-    def pairs(self, before) -> "Samples":
+    def pairs(self, before: Int[np.ndarray, " k"]) -> "Samples":
         """States at both ends of intervals, (k, 2, ...)."""
         return self.taken(np.stack([before, before + 1], axis=1))
 
@@ -95,7 +99,7 @@ class _Found(NamedTuple):
     accuracy: float
 
 
-def passages(solution) -> Passages:
+def passages(solution: Solution) -> Passages:
     """Find the passages of one `linkax.Solution`.
 
     **Raises:** `ValueError` for a batch, or where the solution saved functions of its own.
@@ -109,7 +113,7 @@ def passages(solution) -> Passages:
     return Passages(times, float(max(lost, 0.0)), accuracy)
 
 
-def singular_states(solution):
+def singular_states(solution: Solution) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n_q"]]:
     """Find the times of passages, (n,), and the coordinates there, (n, n_q)."""
     found = _passages(solution)
     states = np.array([passage.q for passage in found]).reshape(len(found), solution.q.shape[-1])
@@ -210,7 +214,7 @@ class _Change(NamedTuple):
     change: np.ndarray
     projector: np.ndarray
 
-    def eigenvalues(self):
+    def eigenvalues(self) -> Inexact[np.ndarray, " n"]:
         """Eigenvalues on the independent rows; ones where a motion that diverged has left no numbers."""
         if not np.all(np.isfinite(self.change)):
             return np.ones(len(self.change))
@@ -218,16 +222,16 @@ class _Change(NamedTuple):
         basis = basis[:, : round(np.trace(self.projector))]
         return np.linalg.eigvals(basis.T @ self.change @ basis)
 
-    def turned(self):
+    def turned(self) -> Float[np.ndarray, " n"]:
         """The eigenvalues that have become negative; equal ones, of loops that move alike, once."""
         off = np.abs(self.change - self.projector)
         if np.max(np.sum(off, axis=0), initial=0.0) * np.max(np.sum(off, axis=1), initial=0.0) < 1.0:
             return np.empty(0)  # as the norm of what the eigenvalues differ from one by is below one
-        values = self.eigenvalues()
+        values: Any = self.eigenvalues()
         turned = np.sort(values.real[values.real < -np.abs(values.imag)])
         return turned[np.diff(turned, prepend=-np.inf) > ALIKE * np.abs(turned)]
 
-    def smallest(self):
+    def smallest(self) -> float | np.floating:
         """The eigenvalue nearest to zero."""
         values = self.eigenvalues()
         return values[np.argmin(np.abs(values))].real
@@ -278,7 +282,15 @@ def _on_cubic(system, ts, qs, vs, place):
 
 
 @quick_compile
-def between_states(mechanism, tangent_space, rank_nearby, ts, qs, vs, places):
+def between_states(
+    mechanism: Mechanism,
+    tangent_space: TangentSpace,
+    rank_nearby: Int[Array, " k"] | None,
+    ts: Float[Array, "n 2"],
+    qs: Float[Array, "n 2 n_q"],
+    vs: Float[Array, "n 2 n_v"],
+    places: Float[Array, " n"],
+) -> tuple[Float[Array, "n m m"], Float[Array, "n m m"], Float[Array, " n"], Float[Array, "n n_q"]]:
     """J at shares between two states times its right inverse G at the first; J G there; d and q at the shares.
 
     All with a leading axis.

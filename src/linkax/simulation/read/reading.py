@@ -1,8 +1,10 @@
 """Reading a solution: functions of `Observables` over all its times and members, each kept while the solution lives."""
 
 import weakref
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float, Int
@@ -11,21 +13,24 @@ from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
+from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.problem import Problem
+from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
+from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import Program, all_concrete
 
 FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
 
 
-def read_in_motion(function, solution, *details):
+def read_in_motion(function: Callable[..., Any], solution: Solution, *details: Any) -> Any:
     """`read` of a function that needs accelerations or multipliers, for which all such share a program."""
     return read(function, solution, *details, dynamics=read(Observables.solve, solution))
 
 
-def read(function, solution, *details, dynamics=()):
+def read(function: Callable[..., Any], solution: Solution, *details: Any, dynamics: Dynamics | tuple[()] = ()) -> Any:
     """Evaluate a function of `Observables` at all times of all members of a batch."""
     if solution.q is None:
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
@@ -87,7 +92,14 @@ def _of_times(function, motion: SavedMotion, dynamics, details):
 
 
 @eqx.filter_jit
-def evaluate_dense(mechanism, formulation, accuracy, rank_nearby, interpolation, t):
+def evaluate_dense(
+    mechanism: Mechanism,
+    formulation: AbstractFormulation,
+    accuracy: Accuracy,
+    rank_nearby: Int[Array, " k"] | None,
+    interpolation: diffrax.DenseInterpolation,
+    t: Float[Array, ""],
+) -> State:
     dtype = interpolation.t0.dtype
     t = jnp.asarray(t, dtype)
     y = interpolation.evaluate(t)

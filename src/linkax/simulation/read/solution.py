@@ -13,7 +13,7 @@ from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import number, one_of, real, require
+from linkax.model.numbers import Number, Vector, number, one_of, real, require
 from linkax.simulation.explain.error_estimate import refined_run
 from linkax.simulation.explain.remarks import remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
@@ -28,6 +28,9 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import concrete
+
+# A point of a body: a frame, a position on it, or None for its centre of mass, see `Solution.position`.
+Place = str | Number | Vector | None
 
 
 class Solution(eqx.Module):
@@ -108,7 +111,12 @@ class Solution(eqx.Module):
 
     @staticmethod
     def of_state(
-        mechanism: Mechanism, state: State, *, t=0.0, accuracy: Accuracy = BALANCED, formulation=None
+        mechanism: Mechanism,
+        state: State,
+        *,
+        t: Number = 0.0,
+        accuracy: Accuracy = BALANCED,
+        formulation: str | AbstractFormulation | None = None,
     ) -> "Solution":
         """A solution of one time, to read reactions, energies or accelerations at a `State` on the closed loops."""
         state = checked_state(mechanism, state)
@@ -134,7 +142,7 @@ class Solution(eqx.Module):
             interpolation=None,
         )
 
-    def position(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+    def position(self, body: str, at: Place = None) -> Float[Array, "*batch n_t 3"]:
         """Position of a body's centre of mass, or of the point `at` on it [m].
 
         `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m]. On a beam,
@@ -142,11 +150,11 @@ class Solution(eqx.Module):
         """
         return self._of_point(Observables.position, body, at)
 
-    def velocity(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+    def velocity(self, body: str, at: Place = None) -> Float[Array, "*batch n_t 3"]:
         """Velocity of a body's centre of mass, or of the point `at` on it [m/s]."""
         return self._of_point(Observables.velocity, body, at)
 
-    def acceleration(self, body: str, at=None) -> Float[Array, "*batch n_t 3"]:
+    def acceleration(self, body: str, at: Place = None) -> Float[Array, "*batch n_t 3"]:
         """Acceleration of a body's centre of mass, or of the point `at` on it [m/s²]."""
         return self._of_point(Observables.acceleration, body, at)
 
@@ -261,7 +269,7 @@ class Solution(eqx.Module):
         """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
         return read(Observables.distance, self)
 
-    def error_estimate(self, reading: "Callable[[Solution], Any] | None" = None, *, factor: Any = 1e-2):
+    def error_estimate(self, reading: "Callable[[Solution], Any] | None" = None, *, factor: Number = 1e-2) -> Any:
         """How far this run is off, found by a second one that is more accurate.
 
         The second run is in double precision, at tolerances `factor` times those of this one but not below 1e-13,
@@ -303,7 +311,7 @@ class Solution(eqx.Module):
         """
         return passages(self)
 
-    def evaluate(self, t) -> State:
+    def evaluate(self, t: Number) -> State:
         """The state at a time [s] between the steps; needs `saveat=SaveAt(dense=True)`."""
         if self.interpolation is None:
             raise ValueError("evaluate needs a dense solution; simulate with saveat=diffrax.SaveAt(dense=True)")
