@@ -6,7 +6,6 @@ about each one's own reference point, so that small bodies far out on a mechanis
 
 from functools import reduce
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -82,7 +81,7 @@ def applied_load(motion: Motion) -> Load:
 
 def inertial_wrench(
     motion: Motion, angular_acceleration: Float[Array, "n_b 3"], acceleration: Float[Array, "n_b 3"]
-) -> tuple[Float[jax.Array, "n_b 3"], Float[jax.Array, "n_b 3"]]:
+) -> tuple[Float[Array, "n_b 3"], Float[Array, "n_b 3"]]:
     """Force m a [N] and moment I α + ω × I ω about the centre of mass [N m] of each body, (n_b, 3) each.
 
     **Arguments:** accelerations of the bodies [rad/s²] and of their reference points [m/s²].

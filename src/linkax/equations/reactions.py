@@ -71,7 +71,7 @@ def reactions(motion: Motion, acceleration: Float[Array, " n_v"], multipliers: F
     """
     load, cut = applied_load(motion), cut_reactions(motion.configuration, multipliers)
     force, moment = inertial_wrench(motion, *body_accelerations(motion, acceleration))
-    needed = Load(force - load.force, moment - load.moment, load.joint_force)
+    needed = Load(jnp.asarray(force) - load.force, jnp.asarray(moment) - load.moment, load.joint_force)
     return _carried(motion.configuration, needed, cut, multipliers)
 
 

@@ -125,12 +125,17 @@ def singular_limit(
     one = jnp.ones((), q.dtype)
     start = _Trip(jnp.zeros((), int), zeros, pairs, one, one)
     trip = bounded_while_loop(unfinished, body, start, max_steps=LAST + 1)
-    scales = [largest(pair[0]) + fastest**power for pair, power in zip(trip.sums, powers, strict=True)]
-    smooth = [
-        largest(differences) <= tolerance * scale
-        for sums, scale in zip(trip.sums, scales, strict=True)
-        for differences, tolerance in zip(sums[1:], TOLERANCES, strict=True)
-    ]
-    holds = (trip.distance < NEAR) & (trip.gap < CLOSED) & jnp.all(jnp.stack(smooth))
+    holds = (trip.distance < NEAR) & (trip.gap < CLOSED) & _is_smooth(trip.sums, powers, fastest)
     answers = jax.tree.map(lambda pair, itself: jnp.where(holds, pair[0], itself), trip.sums, trip.itself)
     return answers, trip.distance
+
+
+def _is_smooth(sums, powers, fastest):
+    """Whether high differences of the values are small: of each answer first the limit, then its differences."""
+    scales = [largest(pair[0]) + fastest**power for pair, power in zip(sums, powers, strict=True)]
+    smooth = [
+        largest(differences) <= tolerance * scale
+        for pair, scale in zip(sums, scales, strict=True)
+        for differences, tolerance in zip(pair[1:], TOLERANCES, strict=True)
+    ]
+    return jnp.all(jnp.stack(smooth))

@@ -110,7 +110,8 @@ def saves_times(saveat: diffrax.SaveAt | None) -> bool:
     """Whether states are saved at given times, and nothing else."""
     if jax.tree.structure(saveat) != jax.tree.structure(save_at(np.zeros(1))):
         return False
-    return not (saveat.subs.t0 or saveat.subs.t1 or saveat.subs.steps)
+    (sub,) = _subs(saveat)
+    return not (sub.t0 or sub.t1 or sub.steps)
 
 
 def save_at(ts: Any) -> diffrax.SaveAt:

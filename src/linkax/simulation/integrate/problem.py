@@ -76,7 +76,7 @@ class Problem(eqx.Module):
 
     def corrected(
         self, t: Float[Array, ""], y: Float[Array, " n"], error: Float[Array, " n"] | None = None
-    ) -> tuple[Float[Array, " n"], Errors | None, Float[Array, ""]]:
+    ) -> tuple[Float[Array, " n"], tuple[Float[Array, " n_v"], ...] | None, Float[Array, ""]]:
         """A vector after a step and its error estimate, both corrected, and the distance d there."""
         errors = () if error is None else self.errors(y, error)
 

@@ -100,21 +100,9 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         controller_state: tuple[Any, Int[Array, ""]],
     ) -> tuple[Bool[Array, ""], Float[Array, ""], Any, Any, tuple[Any, Int[Array, ""]], diffrax.RESULTS]:
         """Accept or reject the step, and choose the next one; `y_error` is a `StepError`."""
-        scales = args.system.scales
         magnitude, candidate = (_magnitudes(args, y) for y in (y0, y1_candidate))
-        scaled = None
-        if y_error.error is not None and self.is_adaptive:
-            noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), args.method.distance_floor)
-            # The second is none where the step has led to no numbers.
-            largest = jax.tree.map(
-                lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), magnitude, candidate
-            )
-            # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
-            least = jnp.minimum(SEEN_ULPS * jnp.finfo(scales.dtype).eps, SEEN * self.innermost.rtol)
-            scaled = tuple(
-                jnp.maximum(jnp.abs(_less(e / scales, noise * scale)), least * scale)
-                for e, scale in zip(y_error.error, largest, strict=True)
-            )
+        measured = y_error.error is not None and self.is_adaptive
+        scaled = self._scaled_error(args, y_error, magnitude, candidate) if measured else None
         before, retries = controller_state
         keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
             t0, t1, magnitude, candidate, args, scaled, error_order, before
@@ -143,6 +131,19 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             jump & jnp.logical_not(again),
             (either(before, after), jnp.where(again, retries + 1, jnp.where(keep, 0, retries))),
             result,
+        )
+
+    def _scaled_error(self, problem, y_error, magnitude, candidate):
+        """The error of q and v in the scales of the mechanism, with rounding taken off."""
+        scales = problem.system.scales
+        noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), problem.method.distance_floor)
+        # The second is none where the step has led to no numbers.
+        largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), magnitude, candidate)
+        # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
+        least = jnp.minimum(SEEN_ULPS * jnp.finfo(scales.dtype).eps, SEEN * self.innermost.rtol)
+        return tuple(
+            jnp.maximum(jnp.abs(_less(e / scales, noise * scale)), least * scale)
+            for e, scale in zip(y_error.error, largest, strict=True)
         )
 
 

@@ -194,23 +194,11 @@ def cotangents_over_steps(
         k, j, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = carry
         ends = steps.ts[k], steps.ts[k + 1]
         dense = _uncorrected(solver, ivp.problem, *ends, steps.ys[k])
-        begin_bar = end_bar = jnp.zeros_like(ends[0])
-        dense_bar = jax.tree.map(jnp.zeros_like, dense)
+        zero = jnp.zeros_like(ends[0])
+        of_step = j, zero, zero, jax.tree.map(jnp.zeros_like, dense), saved_bar
         if saved is not None:
-
-            def save(carry):
-                j, *bars, saved_bar = carry
-                within = functools.partial(_within, solver)
-                *more, t_bar = jax.vjp(within, *ends, dense, saved[j])[1](saved_cotangent[j])
-                bars = jax.tree.map(jnp.add, tuple(bars), tuple(more))
-                return j - 1, *bars, saved_bar.at[j].set(t_bar)
-
-            def inside(carry):
-                j = carry[0]
-                return (j >= 0) & ((saved[jnp.maximum(j, 0)] > ends[0]) | (k == 0))
-
-            begin = j, begin_bar, end_bar, dense_bar, saved_bar
-            j, begin_bar, end_bar, dense_bar, saved_bar = lax.while_loop(inside, save, begin)
+            of_step = _cotangents_of_saves(solver, saved, saved_cotangent, ends, dense, k == 0, of_step)
+        j, begin_bar, end_bar, dense_bar, saved_bar = of_step
         sides = ivp.problem.sides(steps.ys[k + 1])
         more, begin_more, end_more, y_bar = _step_vjp(
             solver, of_problem, problem, *ends, dense, sides, y_bar, dense_bar
@@ -229,3 +217,20 @@ def cotangents_over_steps(
         lambda carry: carry[0] >= 0, with_products_as_sums(one), begin
     )
     return eqx.filter(InitialValueProblem(problem_bar, y_bar, t0_bar, t1_bar, saved_bar), wanted)
+
+
+def _cotangents_of_saves(solver, saved, saved_cotangent, ends, dense, is_first, begin):
+    """VJP of all that is saved in one step, from the last: add cotangents to (j, t0, t1, dense output, saved times)."""
+
+    def save(carry):
+        j, *bars, saved_bar = carry
+        within = functools.partial(_within, solver)
+        *more, t_bar = jax.vjp(within, *ends, dense, saved[j])[1](saved_cotangent[j])
+        bars = jax.tree.map(jnp.add, tuple(bars), tuple(more))
+        return j - 1, *bars, saved_bar.at[j].set(t_bar)
+
+    def inside(carry):
+        j = carry[0]
+        return (j >= 0) & ((saved[jnp.maximum(j, 0)] > ends[0]) | is_first)
+
+    return lax.while_loop(inside, save, begin)

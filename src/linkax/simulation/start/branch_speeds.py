@@ -34,18 +34,18 @@ APART = 1e-3  # of the largest speed: what tells branches apart
 class _Asked(eqx.Module):
     """The equations for speeds, over `scale`: rows @ v = right (loops, and speeds held), and v on a branch."""
 
-    crossing: ConstraintSplit
+    split: ConstraintSplit
     rows: Array
     right: Array
     scale: Array
 
     def rest(self, v: Float[Array, " n_v"]) -> Float[Array, " n"]:
         """The residual of the equations at speeds v."""
-        return jnp.concatenate([self.right - self.rows @ v, -self.crossing.off_branch(v, self.scale)])
+        return jnp.concatenate([self.right - self.rows @ v, -self.split.off_branch(v, self.scale)])
 
     @property
     def system(self) -> System:
-        return self.crossing.configuration.system
+        return self.split.configuration.system
 
     def slopes(self, v: Float[Array, " n_v"]) -> Float[Array, "n n_v"]:
         return -jax.jacfwd(self.rest)(v)
@@ -80,14 +80,14 @@ class _Asked(eqx.Module):
     def off_branch(self, v: Float[Array, " n_v"]) -> Float[Array, ""]:
         """How far speeds are from a branch, over the square of the largest."""
         fastest = self.system.fastest(v)
-        off = largest(self.crossing.off_branch(v, self.scale))
+        off = largest(self.split.off_branch(v, self.scale))
         return ratio(off, fastest**2, 0.0)
 
 
 @eqx.filter_custom_jvp
 def _on_branch(asked, v):
     """Find speeds on a branch by Newton steps from a little beside v, which may lie just between two branches."""
-    beside = BESIDE * jnp.sum(asked.crossing.inverse.basis, axis=1)
+    beside = BESIDE * jnp.sum(asked.split.inverse.basis, axis=1)
     off = asked.off_branch(v) > ON_BRANCH * rank_tolerance(v.dtype)
     turn = lambda _, v: v + nearest_solution(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
     # As many each time: with a loop that ends sooner XLA (jaxlib 0.10) finds no callbacks in the rest of the program.
@@ -105,13 +105,13 @@ def _on_branch_jvp(primals, changes):
 
 def _asked(configuration, held):
     system = configuration.system
-    crossing = ConstraintSplit.of(configuration, rank_tolerance(system.dtype))
+    split = ConstraintSplit.of(configuration, rank_tolerance(system.dtype))
     right = jnp.concatenate([rate(system, configuration.t), *held.values])
     size = largest(right)
     scale = lax.stop_gradient(jnp.where(size > 0.0, size, 1.0))
     still = jnp.zeros(system.topology.num_speeds, system.dtype)
-    rows = jnp.concatenate([crossing.jacobian, *jax.jacfwd(lambda v: held.speeds(move(configuration, v)))(still)])
-    return _Asked(crossing, rows, right / scale, scale)
+    rows = jnp.concatenate([split.jacobian, *jax.jacfwd(lambda v: held.speeds(move(configuration, v)))(still)])
+    return _Asked(split, rows, right / scale, scale)
 
 
 def speeds_on_branch(
@@ -126,12 +126,12 @@ def speeds_on_branch(
     joint; how far the speeds are from a branch, relative to themselves; whether there may be other branches.
     """
     asked = _asked(configuration, held)
-    crossing, scale = asked.crossing, asked.scale
+    split, scale = asked.split, asked.scale
     least, undecided = asked.least()
     v = _on_branch(asked, least)
     # What the loops leave of them: a row that is nearly none opens little, and yet may allow no motion at all.
-    opened = crossing.jacobian @ least - asked.right[: crossing.jacobian.shape[0]]
-    reached = held.speeds(move(configuration, scale * (least - crossing.inverse.normal @ opened)))
+    opened = split.jacobian @ least - asked.right[: split.jacobian.shape[0]]
+    reached = held.speeds(move(configuration, scale * (least - split.inverse.normal @ opened)))
     misses = JointValues(held.terms, tuple(found - entry for found, entry in zip(reached, held.values, strict=True)))
     return scale * v, misses, jnp.maximum(asked.off_branch(v), asked.missed(v)), undecided
 

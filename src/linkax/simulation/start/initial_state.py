@@ -69,7 +69,7 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
     method, system, t, given, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, state.q, q, v))
     # A singular mass matrix has spoiled them.
     q, v = jnp.where(jnp.all(jnp.isfinite(q)), q, given), jnp.where(jnp.isfinite(v), v, 0.0)
-    crossing, mass, acceleration, definiteness = method.at_rest(system, t, q)
+    split, mass, acceleration, definiteness = method.at_rest(system, t, q)
     eps = jnp.finfo(system.dtype).eps
     massive = definiteness > SINGULAR_ULPS * eps * len(v)
     assembled = jnp.logical_not(jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isposinf(state.v)) & (len(state.v) > 0))
@@ -78,18 +78,18 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
     if system.topology.num_rows == 0:
         true = jnp.ones((), bool)
         sound = assembled, finite, massive, true, true, true
-        return InitialCheck(begins, start, jnp.zeros((), bool), crossing.inverse.rank, definiteness, *sound)
-    gap = gaps(crossing.configuration).in_scales(system)
+        return InitialCheck(begins, start, jnp.zeros((), bool), split.inverse.rank, definiteness, *sound)
+    gap = gaps(split.configuration).in_scales(system)
     small = jnp.sqrt(eps)
     at_rest = system.fastest(v) ** 2 <= eps * system.fastest(acceleration)
     direction = jnp.where(at_rest, acceleration, v)
-    off, rank = crossing.along(direction, at_rest)
+    off, rank = split.along(direction, at_rest)
     # Rows that are not quite dependent contradict each other by as much.
     on_branch = largest(off) <= ON_BRANCH * method.tolerance
     return InitialCheck(
         t=begins,
         state=start,
-        singular=jnp.any(rank > crossing.inverse.rank),
+        singular=jnp.any(rank > split.inverse.rank),
         rank=ranks_along(method, system, t, q, direction, rank),
         definiteness=definiteness,
         assembled=assembled,
