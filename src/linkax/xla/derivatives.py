@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
@@ -22,7 +23,7 @@ def ratio(
     return jnp.where(b > 0.0, a / jnp.where(b > 0.0, b, 1.0), otherwise)
 
 
-def materialise(primal: Array | float, change: Array | None) -> Array:
+def materialise(primal: Array | np.floating | float, change: Array | None) -> Array:
     """Return a tangent as an array; None, the tangent of what does not change, as zeros."""
     return jnp.zeros_like(primal) if change is None else change
 

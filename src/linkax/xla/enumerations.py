@@ -3,13 +3,14 @@
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 from equinox._enum import EnumerationItem
 from jaxtyping import Int
 
 from linkax.xla.arrays import Array
 
 
-def code(item: eqx.Enumeration | EnumerationItem) -> Int[Array, "..."]:
+def code(item: eqx.Enumeration | EnumerationItem) -> Int[Array | np.integer, "..."]:
     """The number of an item, or the numbers of a batch."""
     return item._value
 
