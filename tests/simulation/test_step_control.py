@@ -46,6 +46,16 @@ def test_a_stage_close_to_a_singular_configuration_is_moved_away(controller):
     assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
 
 
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_an_error_from_such_a_stage_does_not_choose_the_next_try(controller):
+    """It is rounding, however short the step: steps cut by it would crawl into the singular configuration."""
+    error = FAR._replace(error=(jnp.array([1e-4, 0.0]), jnp.zeros(2)))
+    assert adapt(controller, error)[2] < 0.5
+    keep, next_t0, next_t1, _, (_, retries), _ = adapt(controller, error._replace(passes=jnp.asarray(1e-3)))
+    assert not keep
+    assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
+
+
 @pytest.mark.parametrize(
     "error",
     [

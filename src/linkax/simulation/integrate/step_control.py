@@ -35,9 +35,9 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     near a singular configuration.
 
     An adaptive step with a stage close to a singular configuration is tried again, shorter, so that the configuration
-    falls between two stages. Where a few tries do not help, or the step begins in the singular configuration, it is
-    left as it is. A step that goes past a switch of a force element is tried again up to there, see
-    `linkax.simulation.integrate.switches`.
+    falls between two stages, whatever its error: that is rounding of this stage. Where a few tries do not help, or the
+    step begins in the singular configuration, it is left as it is. A step that goes past a switch of a force element is
+    tried again up to there, see `linkax.simulation.integrate.switches`.
 
     - `is_undifferentiated`: see `ProjectedSolver`.
     """
@@ -116,7 +116,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             result = diffrax.RESULTS.where(finite, result, diffrax.RESULTS.dt_min_reached)
             return keep & finite, jnp.where(finite, next_t0, t0), next_t1, jump, (after, retries), result
         near = jnp.minimum(args.accuracy.clearance, FEASIBLE * y_error.leaves)
-        again = keep & (y_error.passes < near) & (retries < MOST_RETRIES)
+        again = (y_error.passes < near) & (retries < MOST_RETRIES)
         end = t0 + y_error.retry * (t1 - t0)
         if y_error.switch is not None:
             late = y_error.switch < 1.0
