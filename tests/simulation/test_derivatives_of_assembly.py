@@ -15,12 +15,15 @@ def scenes(*quick):
     return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in SCENES]
 
 
+FEWER = {"n-four-bar": {"N": 2}, "telescopic-crane": {"elements": 1}}  # parts of the same kinds
+
+
 class Numbers:
     """The numbers of a scene's mechanism, and its assembled state as a function of them."""
 
     def __init__(self, name):
         self.scene = SCENES[name]
-        self.settings = self.scene.settings(None, {"N": 2} if name == "n-four-bar" else {})
+        self.settings = self.scene.settings(None, FEWER.get(name, {}))
         leaves, self.structure = jax.tree.flatten(self.scene.mechanism(self.settings))
         self.leaves = [jnp.asarray(leaf) for leaf in leaves]
         self.changeable = [i for i, leaf in enumerate(self.leaves) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
