@@ -4,6 +4,7 @@ import sys
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
+from zlib import crc32
 
 # The settings that users have, for tests marked users_settings.
 AS_USERS_DO = os.environ.get("AS_USERS_DO") == "1"
@@ -56,7 +57,16 @@ gc.set_threshold(20_000, 20, 50)  # tracing makes many objects at a time, few of
 MOST_MAPS = 40_000  # of the 65 530 that Linux gives a process; beyond them the compiler crashes
 
 
-def pytest_collection_modifyitems(items):
+def pytest_addoption(parser):
+    parser.addoption("--share", metavar="K/N", help="run share K = 0, ..., N - 1 of N of the tests that are chosen")
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.option.share:
+        share, shares = map(int, config.option.share.split("/"))
+        in_share = lambda item: crc32(item.nodeid.encode()) % shares == share
+        config.hook.pytest_deselected(items=[item for item in items if not in_share(item)])
+        items[:] = filter(in_share, items)
     place = {name: index for index, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))
 
