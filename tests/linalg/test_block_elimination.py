@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from linkax.linalg.block_elimination import SaddlePointInFronts, in_fronts, invert_by_blocks, with_identity_metric
-from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.elimination_plan import plan_elimination
+from linkax.linalg.saddle_inverse import invert
 from linkax.linalg.static_sparse import StaticSparse
 
 TOLERANCE = 1e-9

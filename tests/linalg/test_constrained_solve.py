@@ -10,8 +10,9 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from linkax.linalg.constrained_solve import constrained_solve, invert, invert_apart, with_mass
+from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.least_multipliers import least_multipliers
+from linkax.linalg.saddle_inverse import invert, invert_apart, with_mass
 
 TOLERANCE = 1e-10
 METRICS = ["mass", "identity"]

@@ -8,8 +8,9 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.pivoted_qr import ENTRIES, TOGETHER, pivoted_qr
+from linkax.linalg.saddle_inverse import invert
 
 SHAPES = {"tall": (7, 4), "wide": (4, 7), "square": (6, 6), "row": (1, 5), "column": (5, 1)}
 

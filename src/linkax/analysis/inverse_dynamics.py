@@ -15,8 +15,9 @@ from linkax.equations.loops import gamma, jacobian
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.least_multipliers import least_multipliers
+from linkax.linalg.saddle_inverse import invert
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.state import State

@@ -8,8 +8,8 @@ from jaxtyping import ArrayLike, Bool, Float, Int
 from linkax.equations.system import system_of
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.linalg.constrained_solve import singularity_distance
 from linkax.linalg.least_multipliers import least_multipliers
+from linkax.linalg.saddle_inverse import singularity_distance
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import require_type
 from linkax.model.topology import Topology

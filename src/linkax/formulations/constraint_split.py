@@ -17,8 +17,9 @@ from linkax.equations.configuration import Configuration, configure
 from linkax.equations.loops import drive_acceleration, jacobian, velocity_gamma
 from linkax.equations.motion import move
 from linkax.equations.system import System
-from linkax.linalg.constrained_solve import SaddleInverse, constrained_solve, invert_apart
+from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.linalg.saddle_inverse import SaddleInverse, invert_apart
 from linkax.spatial.vectors import length
 from linkax.xla.arrays import Array, Scalar
 
@@ -115,7 +116,7 @@ class AtRest(NamedTuple):
     """Acceleration from rest at a configuration, and what selects its branch.
 
     - `split`: see `ConstraintSplit`. `mass`: M. `acceleration`: v̇ at v = 0.
-    - `definiteness`: of M on the tangent space, see `linkax.linalg.constrained_solve.SaddleInverse`.
+    - `definiteness`: of M on the tangent space, see `linkax.linalg.saddle_inverse.SaddleInverse`.
     """
 
     split: ConstraintSplit

@@ -23,8 +23,8 @@ from linkax.formulations.formulation import linear_system
 from linkax.formulations.singular_limit import Direction, Value, singular_limit
 from linkax.formulations.tangents import Tangents, state_tangent, unbalanced_tangent
 from linkax.linalg.block_elimination import BlockInverse
-from linkax.linalg.constrained_solve import SaddleInverse
 from linkax.linalg.least_multipliers import least_multipliers
+from linkax.linalg.saddle_inverse import SaddleInverse
 from linkax.linalg.while_falling import while_falling
 from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array, Scalar

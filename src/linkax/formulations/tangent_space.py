@@ -25,14 +25,8 @@ from linkax.formulations import projected_state
 from linkax.formulations.constraint_split import AtRest, ConstraintSplit
 from linkax.formulations.formulation import AbstractFormulation, Dynamics, LinearSystem, linear_system
 from linkax.linalg.block_elimination import BlockInverse, SaddlePointInFronts, invert_by_blocks, with_identity_metric
-from linkax.linalg.constrained_solve import (
-    SaddleInverse,
-    SaddlePoint,
-    constrained_solve,
-    invert_apart,
-    singularity_distance,
-    with_mass,
-)
+from linkax.linalg.constrained_solve import SaddlePoint, constrained_solve
+from linkax.linalg.saddle_inverse import SaddleInverse, invert_apart, singularity_distance, with_mass
 from linkax.model.numbers import Number, number, one_of, require, whole_number
 from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array, Scalar
@@ -154,7 +148,7 @@ class TangentSpace(AbstractFormulation):
         With B = L⁻ᵀ: v̇ = B Q₁ R₁₁⁻ᵀ (Pᵀγ)ᵣ + B Q₂ ζ, where (B Q₂)ᵀ M (B Q₂) ζ = (B Q₂)ᵀ (f − M B Q₁ R₁₁⁻ᵀ (Pᵀγ)ᵣ);
         the multipliers of the independent rows are λ = P R₁₁⁻¹ (B Q₁)ᵀ (M v̇ − f), those of the others zero.
         In the mass metric (B Q₂)ᵀ M (B Q₂) = 1, and W in place of M has the multipliers λ + D γ.
-        `linkax.linalg.constrained_solve.invert` has the products of the factors.
+        `linkax.linalg.saddle_inverse.invert` has the products of the factors.
         """
         inverse = self._with_mass(linear, split)
         product = self._saddle_point(linear, linear.mass, linear.blocks)

@@ -1,6 +1,6 @@
 """The constrained solve front by front, in time proportional to the number of loops that follow each other.
 
-It does what `linkax.linalg.constrained_solve.invert` does at once, in the order of an `elimination_plan`. A
+It does what `linkax.linalg.saddle_inverse.invert` does at once, in the order of an `elimination_plan`. A
 column-pivoted QR of a front's rows splits its speeds, and what motions of the fronts before still affect it, into a
 normal and a tangent space. The tangent space is turned so that few directions affect the speeds passed on; these go on
 to the next front, and of the others the dynamics are solved. All turns are orthogonal in scales, so that nothing grows
@@ -16,9 +16,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float, Int
 
-from linkax.linalg.constrained_solve import independent
 from linkax.linalg.elimination_plan import EliminationPlan
 from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.linalg.saddle_inverse import independent
 from linkax.linalg.static_sparse import StaticSparse, constant_product
 from linkax.linalg.triangular import cholesky_inverse, upper_inverse
 from linkax.spatial.vectors import length
@@ -47,7 +47,7 @@ class BlockInverse(eqx.Module):
 
     - `forwards`: (k, 2s, 2s + p + m). `backwards`: (k, 2s + p + m, 4s + p + m).
     - `last`: inverse of the metric of the directions after the last front, (s, s).
-    - `rank`, (k,), `distance`, `definiteness`: see `linkax.linalg.constrained_solve.SaddleInverse`.
+    - `rank`, (k,), `distance`, `definiteness`: see `linkax.linalg.saddle_inverse.SaddleInverse`.
     """
 
     plan: EliminationPlan = eqx.field(static=True)
@@ -92,7 +92,7 @@ def invert_by_blocks(
     plan: EliminationPlan,
     rank_nearby: Int[Array, " k"] | None = None,
 ) -> BlockInverse:
-    """Invert like `linkax.linalg.constrained_solve.invert`, front by front; `rank_nearby` of each front, (k,)."""
+    """Invert like `linkax.linalg.saddle_inverse.invert`, front by front; `rank_nearby` of each front, (k,)."""
     blocks, scales = lax.stop_gradient((blocks, scales))
     kept_unit, added_unit = (_read(scales, table) for table in (plan.separator_table, plan.interior_table))
     absent = jnp.asarray(plan.interior_table < 0, scales.dtype)

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.linalg.constrained_solve import constrained_solve
+from linkax.linalg.saddle_inverse import invert
 from linkax.xla.arrays import Array, Scalar
 
 

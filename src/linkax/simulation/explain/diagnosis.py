@@ -15,7 +15,7 @@ from linkax.equations.system import System, system_of
 from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.linalg.constrained_solve import invert
+from linkax.linalg.saddle_inverse import invert
 from linkax.model.constraints import Drive
 from linkax.simulation.integrate.results import RESULTS, Solution
 from linkax.simulation.start.initial_state import MOVES, moving_joints

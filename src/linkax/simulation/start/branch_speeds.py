@@ -12,7 +12,7 @@ from linkax.equations.loops import rate
 from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
 from linkax.formulations.constraint_split import ConstraintSplit
-from linkax.linalg.constrained_solve import invert
+from linkax.linalg.saddle_inverse import invert
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.initial_state import ON_BRANCH

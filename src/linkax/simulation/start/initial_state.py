@@ -29,7 +29,7 @@ class InitialCheck(NamedTuple):
     - `singular`: the rank of J is smaller here than beside here.
     - `rank`: of J at the states beside it along the motion, for each island of the mechanism, or each front of its
       elimination plan where it has one.
-    - `definiteness`: of the mass matrix on the tangent space, see `linkax.linalg.constrained_solve.SaddleInverse`.
+    - `definiteness`: of the mass matrix on the tangent space, see `linkax.linalg.saddle_inverse.SaddleInverse`.
     - `assembled`: False for a state that `linkax.assemble` did not find, which it marks by infinite speeds.
     - `finite`, `closed`; `massive`: all that can move has mass; `on_branch`: the speeds lie on a
       branch of the motion; `unique`: so does, at rest, the acceleration.

@@ -8,7 +8,8 @@ from jaxtyping import Float, Int
 
 from linkax.equations.system import System
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.linalg.constrained_solve import constrained_solve, invert
+from linkax.linalg.constrained_solve import constrained_solve
+from linkax.linalg.saddle_inverse import invert
 from linkax.model.beams import BeamElasticity
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.static_scatter import scatter_static
