@@ -101,9 +101,9 @@ def at_rest(mechanism, parameters):
     return lx.equilibrium(mechanism, lx.assemble(mechanism, guess=guess))
 
 
-def slopes_and_differences():
+def slopes_and_differences(**changes):
     """Derivatives of deflection [m] and main frequency [Hz] by what is VARIED, (2, 3), and central differences."""
-    parameters, _, near = crane()
+    parameters, _, near = crane(**changes)
 
     @jax.jit
     def found(numbers):
