@@ -52,7 +52,15 @@ def _raises_unchecked(*args, **options):
 pytest.raises = _raises_unchecked
 
 # Files that take longest begin first, so that at the end no process waits for another.
-LONGEST = ("test_notebooks", "test_gradients", "test_known_answers", "test_singular_starts", "test_compiler")
+LONGEST = (
+    "test_processes",
+    "test_telescopic_crane",
+    "test_notebooks",
+    "test_gradients",
+    "test_known_answers",
+    "test_singular_starts",
+    "test_compiler",
+)
 gc.set_threshold(20_000, 20, 50)  # tracing makes many objects at a time, few of them in cycles
 MOST_MAPS = 40_000  # of the 65 530 that Linux gives a process; beyond them the compiler crashes
 
