@@ -25,6 +25,7 @@ from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import all_concrete, evaluate_now, quick_compile
 
 BALANCED_STEP = 1e-8  # last step above which the search has failed [rad, lengths of the mechanism]
@@ -165,6 +166,6 @@ def _changes(system, method, t, q, v):
         zero = jnp.zeros_like(v)
         scale, left = largest_force(later.motion(zero)[0]), jnp.max(jnp.abs(later.force(zero)), initial=0.0)
         gap = widest_gap(system, instant.t, later.q)
-        return jnp.maximum(jnp.where(left > 0.0, left / jnp.where(scale > 0.0, scale, 1.0), 0.0), gap)
+        return jnp.maximum(ratio(left, scale), gap)
 
     return jnp.max(lax.map(at, instants(system, t, v)))

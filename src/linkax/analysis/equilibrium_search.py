@@ -21,7 +21,7 @@ from linkax.linalg.constrained_solve import constrained_solve
 from linkax.simulation.start.closing import LONGEST_STEP
 from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
-from linkax.xla.derivatives import pushforward
+from linkax.xla.derivatives import pushforward, ratio
 
 MOST_STEPS = 200
 SMALLEST_STEP = 1e-12  # at which the search ends [rad, lengths of the mechanism]
@@ -106,9 +106,9 @@ def search_downhill(
         values, vectors = eigh((stiffness + stiffness.T) / 2.0)
         stiff = jnp.abs(values) > NEUTRAL * jnp.max(jnp.abs(values))
         along = vectors.T @ force
-        downhill = vectors @ jnp.where(stiff, along / jnp.where(stiff, jnp.abs(values), 1.0), along)
+        downhill = vectors @ ratio(along, jnp.where(stiff, jnp.abs(values), 0.0))
         step = here.basis @ downhill
-        shorter = jnp.minimum(1.0, LONGEST_STEP / jnp.where(size(step) > 0.0, size(step), 1.0))
+        shorter = jnp.minimum(1.0, ratio(LONGEST_STEP, size(step)))
         lowest = jnp.where(stiff[0], jnp.minimum(values[0], 0.0), 0.0)
         circulation = jnp.max(jnp.abs(stiffness - stiffness.T)) / 2.0
         aside = here.basis @ vectors[:, 0]

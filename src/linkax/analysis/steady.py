@@ -100,7 +100,7 @@ def missed_rates(
     """|J v − b| of each loop row and constraint, relative to the largest speed and the largest rate b asked for."""
     asked = rate(system, t)
     size = jnp.maximum(system.fastest(v), largest(asked))
-    return jnp.abs(jacobian(configure(system, t, q)) @ v - asked) / jnp.where(size > 0.0, size, 1.0)
+    return ratio(jnp.abs(jacobian(configure(system, t, q)) @ v - asked), size)
 
 
 def of_missed_rate(mechanism: Mechanism, missed: np.ndarray, row: int, t: Float[Array, ""]) -> str:

@@ -38,6 +38,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import all_concrete, concrete, quick_compile
 
 NEAR = 1e-6  # distance from an equilibrium up to which a state counts as in it [rad, lengths of the mechanism]
@@ -99,7 +100,7 @@ class _Moving(Nearby):
         """The largest gap of the loops, rate that speeds miss, or slope at which T opens the loops."""
         slopes = jacobian(configure(self.system, self.t, self.q)) @ self.basis
         longest = largest(self.basis / self.system.scales[:, None])
-        apart = largest(slopes) / jnp.where(longest > 0.0, longest, 1.0)
+        apart = ratio(largest(slopes), longest)
         misses = missed_rates(self.system, self.t, self.q, self.v)
         gap = widest_gap(self.system, self.t, self.q)
         return jnp.maximum(jnp.maximum(apart, gap), jnp.max(misses, initial=0.0))

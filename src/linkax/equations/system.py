@@ -17,6 +17,7 @@ from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import largest
 from linkax.spatial.vectors import length as length_of
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import positive_or_one
 
 
 class System(eqx.Module):
@@ -165,8 +166,7 @@ def _lengths(topology, parent_offset, child_offset, center_of_mass, bent):
     loop_length = jnp.stack([way / 2 for way in around]) if around else jnp.zeros(0, ends.dtype)
     to_mass = length_of(center_of_mass - ends[far])
     reach = jnp.asarray(topology.path[:-1], ends.dtype) @ link + to_mass
-    length = jnp.max(jnp.concatenate([loop_length, reach]))
-    length = jnp.where(length > 0.0, length, 1.0)
+    length = positive_or_one(jnp.max(jnp.concatenate([loop_length, reach])))
     return jnp.where(loop_length > 0.0, loop_length, length), length
 
 

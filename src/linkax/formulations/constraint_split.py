@@ -22,6 +22,7 @@ from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.saddle_inverse import SaddleInverse, invert_apart
 from linkax.spatial.vectors import length
 from linkax.xla.arrays import Array, Scalar
+from linkax.xla.derivatives import positive_or_one, ratio
 
 OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
 
@@ -60,8 +61,7 @@ class ConstraintSplit(eqx.Module):
     def _basis_of_ones(self):
         """The basis of the null space of J, each direction of length one in scales."""
         basis = self.inverse.basis
-        size = length(basis / self.configuration.system.scales[:, None], axis=0)
-        return basis / jnp.where(size > 0.0, size, 1.0)
+        return ratio(basis, length(basis / self.configuration.system.scales[:, None], axis=0))
 
     def off_branch(self, v: Float[Array, " n_v"], scale: Scalar | float = 1.0) -> Float[Array, " m"]:
         """The part of γ(v, v) outside the range of J, (m,): zero for speeds on a branch.
@@ -91,8 +91,7 @@ class ConstraintSplit(eqx.Module):
         **Returns:** `off_branch` for the largest speed one, (m,); by first-order perturbation
         rank(J) + rank(Uᵀ J̇ N), U and N the null spaces of Jᵀ and J, (k,).
         """
-        fastest = self.configuration.system.fastest(v)
-        scale = jnp.where(fastest > 0.0, fastest, 1.0)
+        scale = positive_or_one(self.configuration.system.fastest(v))
         direction = v / scale
         # γ = −J̇ v is quadratic in v, so −J̇ w is a quarter of γ(v + w) − γ(v − w). All at once, to compile γ once.
         basis = self._basis_of_ones()

@@ -28,7 +28,7 @@ from linkax.linalg.saddle_inverse import SaddleInverse
 from linkax.linalg.while_falling import while_falling
 from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array, Scalar
-from linkax.xla.derivatives import ratio
+from linkax.xla.derivatives import positive_or_one, ratio
 from linkax.xla.tracing import jit_inline
 
 ROUNDING_ULPS = 8.0
@@ -244,4 +244,4 @@ def _gap(system, t, q):
 def _inertia(system):
     """Of the magnitude of the mechanism's [kg m²]: multipliers over it are of that of accelerations."""
     found = jnp.sum(system.mass) * system.length**2 + largest(system.inertia)
-    return lax.stop_gradient(jnp.where(found > 0.0, found, 1.0))
+    return lax.stop_gradient(positive_or_one(found))

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import positive_or_one, ratio
 
 # A CPU factorises so many matrices together, if they have so many entries; fewer are faster each by itself, and many
 # more do not fit into its cache.
@@ -80,7 +81,7 @@ def _single(a):
         norm = jnp.sqrt(remaining[place])
         reflector = jnp.where(rows == step, head + jnp.where(head < 0.0, -norm, norm), column)
         size = jnp.sum(reflector * reflector)
-        scale = jnp.where(size > 0.0, 2.0 / jnp.where(size > 0.0, size, 1.0), 0.0)
+        scale = ratio(2.0, size, 0.0)
         return work - (scale * reflector)[:, None] * (reflector @ work)[None, :], order
 
     work, order = jnp.concatenate([a, jnp.eye(n, dtype=a.dtype)], axis=1), places
@@ -118,7 +119,7 @@ def _together(matrices):
         head, column = _of_columns(_row(work, step), chosen[None]), _of_columns(work, chosen[None])
         # Half of the reflector's square; scaled to the length √2 it is v in I − v vᵀ.
         half = norm * (norm + jnp.abs(head))
-        scale = jnp.where(half > 0.0, lax.rsqrt(jnp.where(half > 0.0, half, 1.0)), 0.0)
+        scale = jnp.where(half > 0.0, lax.rsqrt(positive_or_one(half)), 0.0)
         below = jnp.where(rows > step, column, 0.0)
         reflector = scale * jnp.where(rows == step, head + jnp.where(head < 0.0, -norm, norm), below)
         reflectors = _with_row(reflectors, reflector[None], step)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from linkax.linalg.row_echelon import row_echelon
 from linkax.model.numbers import Number
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import ratio
 
 ROUNDING_ULPS = 10.0
 
@@ -22,7 +23,7 @@ def by_svd(matrix: Float[Array, "m n"], tolerance: Number) -> Float[Array, "n m"
     """The Moore-Penrose inverse by singular values, without those below `tolerance` times the largest."""
     left, sizes, right = jnp.linalg.svd(matrix, full_matrices=False)
     kept = sizes > _cut_off(matrix, tolerance) * sizes[0]
-    inverse = jnp.where(kept, 1.0 / jnp.where(kept, sizes, 1.0), 0.0)
+    inverse = ratio(1.0, jnp.where(kept, sizes, 0.0), 0.0)
     return (right.T * inverse) @ left.T
 
 
@@ -42,7 +43,7 @@ def by_gram_schmidt(matrix: Float[Array, "m n"], tolerance: Number) -> Float[Arr
             row, combination = row - along @ basis, combination - along @ transform
         remains = jnp.linalg.norm(row)
         kept = remains > _cut_off(matrix, tolerance) * jnp.linalg.norm(matrix[place])
-        scale = jnp.where(kept, 1.0 / jnp.where(kept, remains, 1.0), 0.0)
+        scale = ratio(1.0, jnp.where(kept, remains, 0.0), 0.0)
         return basis.at[place].set(scale * row), transform.at[place].set(scale * combination)
 
     empty = jnp.zeros_like(matrix), jnp.zeros((m, m), matrix.dtype)

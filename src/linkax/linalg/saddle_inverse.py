@@ -19,7 +19,7 @@ from linkax.linalg.static_sparse import assembled
 from linkax.linalg.triangular import cholesky_inverse, cholesky_inverse_by_elimination, upper_inverse
 from linkax.spatial.vectors import length
 from linkax.xla.arrays import Array, Scalar
-from linkax.xla.derivatives import ratio
+from linkax.xla.derivatives import positive_or_one, ratio
 from linkax.xla.tracing import jit_inline
 
 Islands = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of each
@@ -250,7 +250,7 @@ def with_mass(inverse: SaddleInverse, mass: Float[Array, "n n"]) -> SaddleInvers
     basis = inverse.basis
     projected, is_empty = basis.T @ mass @ basis, jnp.sum(basis**2, axis=0) == 0.0
     largest = jnp.max(jnp.diagonal(projected), initial=0.0)
-    empty = jnp.diag(jnp.where(is_empty, jnp.where(largest > 0.0, largest, 1.0), 0.0))
+    empty = jnp.diag(jnp.where(is_empty, positive_or_one(largest), 0.0))
     to_basis, definiteness = _lower_inverse(projected + empty)
     root = to_basis @ basis.T
     tangent = root.T @ root

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import ratio
 
 SQUARINGS = 10
 
@@ -24,4 +25,4 @@ def spectral_radius(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch"
 def _scaled(matrix):
     """The largest row sum of a matrix, and the matrix over it."""
     size = jnp.max(jnp.sum(jnp.abs(matrix), axis=-1), axis=-1, initial=0.0)
-    return size, matrix / jnp.where(size > 0.0, size, 1.0)[..., None, None]
+    return size, ratio(matrix, size[..., None, None])

@@ -14,8 +14,9 @@ from linkax.model.elements import Configuration, Motion
 from linkax.model.forces import AbstractForce, Load, described, named
 from linkax.model.functions import Law, evaluated, number_or_law
 from linkax.model.numbers import Number, Vector, number, one_of, zero_or_more
-from linkax.spatial.vectors import dot
+from linkax.spatial.vectors import dot, length
 from linkax.xla.arrays import Array, Scalar
+from linkax.xla.derivatives import ratio
 
 Axes = Literal["ground", "frame"]
 
@@ -41,8 +42,7 @@ class _BetweenPoints(AbstractForce):
 
 def _unit(vector: Float[Array, "3"]) -> Float[jax.Array, "3"]:
     """Divide a vector by its length; zero stays zero."""
-    square = dot(vector, vector)
-    return jnp.where(square > 0.0, vector / jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
+    return ratio(vector, length(vector), 0.0)
 
 
 class Spring(_BetweenPoints):

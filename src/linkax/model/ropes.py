@@ -16,6 +16,7 @@ from linkax.model.functions import Law, evaluated, held_unless
 from linkax.model.numbers import Number, listed, positive, zero_or_more
 from linkax.spatial.vectors import dot, length
 from linkax.xla.arrays import Array, Scalar
+from linkax.xla.derivatives import ratio
 
 Points = tuple[Frame, ...]
 
@@ -38,8 +39,7 @@ def _spans(configuration: Configuration, points: Points) -> Float[jax.Array, "n 
 
 
 def _directions(spans: Float[jax.Array, "n 3"]) -> Float[jax.Array, "n 3"]:
-    size = length(spans)
-    return spans / jnp.where(size > 0.0, size, 1.0)[:, None]
+    return ratio(spans, length(spans)[:, None])
 
 
 def _rate(motion: Motion, points: Points) -> Float[Array, "n 3"]:
@@ -117,7 +117,7 @@ class Rope(AbstractConstraint):
         points = jnp.stack([motion.point_bias(point) for point in self.points])
         along, size = _directions(spans), length(spans)
         turning = dot(rate, rate) - dot(along, rate) ** 2
-        return jnp.sum(dot(along, points[1:] - points[:-1]) + turning / jnp.where(size > 0.0, size, 1.0))
+        return jnp.sum(dot(along, points[1:] - points[:-1]) + ratio(turning, size))
 
 
 class ElasticRope(AbstractForce):

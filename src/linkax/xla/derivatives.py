@@ -16,11 +16,19 @@ from linkax.xla.arrays import Array
 Found = TypeVar("Found")
 
 
+def positive_or_one(b: Float[Array, "*shape"]) -> Float[jax.Array, "*shape"]:
+    """b where b > 0, elsewhere 1: a scale to divide by."""
+    return jnp.where(b > 0.0, b, 1.0)
+
+
 def ratio(
-    a: Float[Array, "*#shape"] | float, b: Float[Array, "*#shape"], otherwise: Float[Array, "*#shape"] | float
+    a: Float[Array, "*#shape"] | float,
+    b: Float[Array, "*#shape"],
+    otherwise: Float[Array, "*#shape"] | float | None = None,
 ) -> Float[jax.Array, "*shape"]:
-    """a / b where b > 0, elsewhere another value; its derivatives hold no NaN of the branch not taken."""
-    return jnp.where(b > 0.0, a / jnp.where(b > 0.0, b, 1.0), otherwise)
+    """a / b where b > 0, elsewhere another value, or a; its derivatives hold no NaN of the branch not taken."""
+    quotient = jnp.divide(a, positive_or_one(b))
+    return quotient if otherwise is None else jnp.where(b > 0.0, quotient, otherwise)
 
 
 def materialise(primal: Array | np.floating | float, change: Array | None) -> Array:

@@ -27,6 +27,7 @@ from linkax.simulation.read.reading import evaluate_dense, read, read_in_motion
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete
 
 # A point of a body: a frame, a position on it, or None for its centre of mass, see `Solution.position`.
@@ -254,11 +255,10 @@ class Solution(eqx.Module):
         """
         violation, speed, acceleration = read_in_motion(Observables.violation_and_scales, self)
         largest = lambda values: jnp.max(jnp.where(jnp.isfinite(self.ts), values, 0.0), axis=-1)
-        relative = lambda values, scale: values / jnp.where(scale > 0.0, scale, 1.0)
         return Violation(
             largest(violation.position),
-            relative(largest(violation.velocity), largest(speed)),
-            relative(largest(violation.acceleration), largest(acceleration)),
+            ratio(largest(violation.velocity), largest(speed)),
+            ratio(largest(violation.acceleration), largest(acceleration)),
         )
 
     def rank(self) -> Int[Array, "*batch n_t"]:

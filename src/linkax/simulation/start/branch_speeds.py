@@ -20,7 +20,7 @@ from linkax.simulation.start.nearest_solution import nearest_solution, rank_tole
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array, Scalar
-from linkax.xla.derivatives import materialise, pushforward, ratio
+from linkax.xla.derivatives import materialise, positive_or_one, pushforward, ratio
 from linkax.xla.tracing import quick_compile
 
 TURNS = 30  # of Newton's method: from close to where y² = x² is flat, each but halves the way
@@ -107,8 +107,7 @@ def _asked(configuration, held):
     system = configuration.system
     split = ConstraintSplit.of(configuration, rank_tolerance(system.dtype))
     right = jnp.concatenate([rate(system, configuration.t), *held.values])
-    size = largest(right)
-    scale = lax.stop_gradient(jnp.where(size > 0.0, size, 1.0))
+    scale = lax.stop_gradient(positive_or_one(largest(right)))
     still = jnp.zeros(system.topology.num_speeds, system.dtype)
     rows = jnp.concatenate([split.jacobian, *jax.jacfwd(lambda v: held.speeds(move(configuration, v)))(still)])
     return _Asked(split, rows, right / scale, scale)

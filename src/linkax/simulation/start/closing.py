@@ -133,7 +133,7 @@ class LoopClosure(eqx.Module):
             ]
             steps = jnp.concatenate(steps)
             longest = jnp.max(jnp.abs(steps / self.system.scales), axis=1, keepdims=True, initial=0.0)
-            steps = steps * jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0.0, longest, 1.0))
+            steps = steps * jnp.minimum(1.0, ratio(LONGEST_STEP, longest))
             changes = (STEP_FRACTIONS[:, None, None] * steps).reshape(-1, steps.shape[1])
             tries = jax.vmap(lambda change: retract(self.system.topology, q, change))(changes)
             tries = jnp.concatenate([tries, q[None]])
