@@ -123,13 +123,13 @@ def _raise_if_open(mechanism, state, t, remainder):
     held = ", ".join(repr(along.joint) for along in remainder.positions.terms) or "none"
     remains = lambda size, unit: f"a gap of {size:.6g} {unit} remains (positions held: {held})"
     advice = "check lengths and offsets, hold fewer positions, or give another guess"
-    cuts = topology.joints[topology.num_bodies :]
-    for name, distance, angle in zip(cuts, remainder.gap.distance, remainder.gap.angle, strict=True):
-        for size, unit, most in ((distance, "m", CLOSED * remainder.length), (angle, "rad", CLOSED)):
-            if not size <= most:
-                raise AssemblyError(f"joint {name!r} does not close: {remains(size, unit)}; {advice}")
-    for constraint, size in zip(mechanism.constraints, remainder.gap.constraints, strict=True):
-        if not size <= remainder.most:
+    gap, scaled = remainder.gap, remainder.gap_in_scales
+    for cut, name in enumerate(topology.joints[topology.num_bodies :]):
+        for size, in_scales, unit in ((gap.distance, scaled.distance, "m"), (gap.angle, scaled.angle, "rad")):
+            if not in_scales[cut] <= CLOSED:
+                raise AssemblyError(f"joint {name!r} does not close: {remains(size[cut], unit)}; {advice}")
+    for constraint, size, in_scales in zip(mechanism.constraints, gap.constraints, scaled.constraints, strict=True):
+        if not in_scales <= CLOSED:
             joints = f" of joint {', '.join(map(repr, constraint.joints))}" if constraint.joints else ""
             raise AssemblyError(
                 f"{constraint.display_name}{joints} is not met at t = {float(t):.6g} s: "
@@ -158,6 +158,7 @@ class _Remainder(eqx.Module):
     """What stays open, for the error message; of each beam the largest change of a strain, and its energy."""
 
     gap: Gap
+    gap_in_scales: Gap
     length: Array
     positions: JointValues
     speeds: JointValues
@@ -172,9 +173,9 @@ class _Remainder(eqx.Module):
 
     def is_met(self) -> Bool[Array, ""]:
         """Whether the loops are closed and all that is held is met."""
-        missed = [*self.positions.values, *self.speeds.values, self.gap.constraints]
-        met = jnp.all(self.gap.distance <= CLOSED * self.length) & jnp.all(self.gap.angle <= CLOSED)
-        return met & jnp.array([jnp.all(jnp.abs(miss) <= self.most) for miss in missed]).all()
+        missed = [*self.positions.values, *self.speeds.values]
+        held = jnp.array([jnp.all(jnp.abs(miss) <= self.most) for miss in missed], dtype=bool).all()
+        return held & (self.gap_in_scales.widest() <= CLOSED)
 
 
 @quick_compile
@@ -192,8 +193,10 @@ def _assemble(mechanism, positions, speeds, guess, t):
     off = jnp.abs(demand.back(q, begin))
     configuration = configure(system, t, q)
     v, misses, off_branch, undecided = speeds_on_branch(configuration, speeds)
+    gap = gaps(configuration)
     remainder = _Remainder(
-        gap=gaps(configuration),
+        gap=gap,
+        gap_in_scales=gap.in_scales(system),
         length=system.length,
         positions=JointValues(positions.terms, demand.misses(configuration)),
         speeds=misses,
