@@ -23,7 +23,7 @@ from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, Scalar, ScalarLike
 from linkax.xla.tracing import jit_inline
 
 
@@ -46,7 +46,7 @@ class Configuration(eqx.Module):
     """
 
     system: System
-    t: Number
+    t: ScalarLike
     q: Float[Array, " n_q"]
     rotation: Float[Array, "n_frames 3 3"]
     link: Float[Array, "n_b 3"]
@@ -193,7 +193,7 @@ def bodies_of_cuts(
 
 
 @jit_inline
-def configure(system: System, t: Number, q: Float[Array, " n_q"]) -> Configuration:
+def configure(system: System, t: ScalarLike, q: Float[Array, " n_q"]) -> Configuration:
     """Compute the poses of all bodies and the motion subspaces of all joints at coordinates q."""
     topology, count = system.topology, system.topology.num_bodies
     parent, child = np.array(topology.parent), np.array(topology.child)

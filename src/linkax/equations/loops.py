@@ -28,9 +28,8 @@ from linkax.equations.loop_rows import (
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
 from linkax.linalg.static_sparse import StaticSparse
-from linkax.model.numbers import Number
 from linkax.model.ropes import Rope
-from linkax.xla.arrays import Array
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import jit_inline
 
 
@@ -91,7 +90,7 @@ def jacobian_entries(configuration: Configuration) -> StaticSparse:
     return StaticSparse.stacked(rows)
 
 
-def rate(system: System, t: Number) -> Float[Array, " m"]:
+def rate(system: System, t: ScalarLike) -> Float[Array, " m"]:
     """b of J v = b, which makes ċ = 0: b = −∂c/∂t, the rates of drives; zero for other rows."""
     nothing = jnp.zeros(system.topology.num_rows, system.dtype)
     if not is_driven(system):
@@ -100,7 +99,7 @@ def rate(system: System, t: Number) -> Float[Array, " m"]:
     return nothing.at[-len(system.constraints) :].set(sides)
 
 
-def drive_acceleration(system: System, t: Number) -> Float[Array, " m"]:
+def drive_acceleration(system: System, t: ScalarLike) -> Float[Array, " m"]:
     """The part of γ that drives cause, ∂b/∂t."""
     nothing = jnp.zeros(system.topology.num_rows, system.dtype)
     if not is_driven(system):

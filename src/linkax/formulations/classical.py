@@ -16,7 +16,7 @@ from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation, Dynamics, LinearSystem, linear_system
 from linkax.model.numbers import Number, whole_number, zero_or_more
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.batches import one_by_one
 from linkax.xla.tracing import jit_inline
 
@@ -130,7 +130,7 @@ class ClassicalFormulation(AbstractFormulation):
     def derivative(
         self,
         system: System,
-        t: Scalar | float,
+        t: ScalarLike,
         q: Float[Array, " n_q"],
         v: Float[Array, " n_v"],
         correct: bool | Bool[Array, ""],
@@ -143,7 +143,7 @@ class ClassicalFormulation(AbstractFormulation):
     def correct(
         self,
         system: System,
-        t: Scalar | float,
+        t: ScalarLike,
         q: Float[Array, " n_q"],
         v: Float[Array, " n_v"],
         errors: tuple[Float[Array, " n_v"], ...] = (),
@@ -166,10 +166,10 @@ class ClassicalFormulation(AbstractFormulation):
         return q, v - back @ (at.jacobian @ v - rate(system, t)), remaining, one
 
     def close(
-        self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+        self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
     ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"]]:
         q, v, _, _ = self.correct(system, t, q, v)
         return q, v
 
-    def dynamics(self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
+    def dynamics(self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
         return self._solved(linear_system(system, t, q), v)

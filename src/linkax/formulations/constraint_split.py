@@ -21,7 +21,7 @@ from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.saddle_inverse import SaddleInverse, invert_apart
 from linkax.spatial.vectors import length
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import positive_or_one, ratio
 
 OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
@@ -38,14 +38,12 @@ class ConstraintSplit(eqx.Module):
     inverse: SaddleInverse
 
     @staticmethod
-    def at(
-        system: System, t: Scalar | float, q: Float[Array, " n_q"], rank_tolerance: Scalar | float
-    ) -> "ConstraintSplit":
+    def at(system: System, t: ScalarLike, q: Float[Array, " n_q"], rank_tolerance: ScalarLike) -> "ConstraintSplit":
         """Split at coordinates q, in the identity metric."""
         return ConstraintSplit.of(configure(system, t, q), rank_tolerance)
 
     @staticmethod
-    def of(configuration: Configuration, rank_tolerance: Scalar | float) -> "ConstraintSplit":
+    def of(configuration: Configuration, rank_tolerance: ScalarLike) -> "ConstraintSplit":
         """Split in the identity metric."""
         system, rows = configuration.system, jacobian(configuration)
         inverse = invert_apart(None, rows, system.scales, rank_tolerance, system.structure.islands)
@@ -63,7 +61,7 @@ class ConstraintSplit(eqx.Module):
         basis = self.inverse.basis
         return ratio(basis, length(basis / self.configuration.system.scales[:, None], axis=0))
 
-    def off_branch(self, v: Float[Array, " n_v"], scale: Scalar | float = 1.0) -> Float[Array, " m"]:
+    def off_branch(self, v: Float[Array, " n_v"], scale: ScalarLike = 1.0) -> Float[Array, " m"]:
         """The part of γ(v, v) outside the range of J, (m,): zero for speeds on a branch.
 
         **Arguments:** `scale`: a factor of the speeds v, whose square is one of γ.

@@ -12,7 +12,7 @@ from linkax.equations.dynamics import mass_entries
 from linkax.equations.loops import jacobian_entries
 from linkax.equations.system import System
 from linkax.linalg.block_elimination import Blocks, in_fronts
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import jit_inline
 
 
@@ -29,7 +29,7 @@ class LinearSystem(NamedTuple):
 
 
 @jit_inline
-def linear_system(system: System, t: Scalar | float, q: Float[Array, " n_q"]) -> LinearSystem:
+def linear_system(system: System, t: ScalarLike, q: Float[Array, " n_q"]) -> LinearSystem:
     """Compute J and M at coordinates q."""
     configuration = configure(system, t, q)
     rows, mass, plan = jacobian_entries(configuration), mass_entries(configuration), system.structure.elimination
@@ -62,7 +62,7 @@ class AbstractFormulation(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def distance_floor(self) -> Scalar | float:
+    def distance_floor(self) -> ScalarLike:
         """The distance d from a singular configuration below which rounding grows no more."""
 
     @property
@@ -74,7 +74,7 @@ class AbstractFormulation(eqx.Module):
     def derivative(
         self,
         system: System,
-        t: Scalar | float,
+        t: ScalarLike,
         q: Float[Array, " n_q"],
         v: Float[Array, " n_v"],
         correct: bool | Bool[Array, ""],
@@ -90,7 +90,7 @@ class AbstractFormulation(eqx.Module):
     def correct(
         self,
         system: System,
-        t: Scalar | float,
+        t: ScalarLike,
         q: Float[Array, " n_q"],
         v: Float[Array, " n_v"],
         errors: tuple[Float[Array, " n_v"], ...] = (),
@@ -99,10 +99,10 @@ class AbstractFormulation(eqx.Module):
 
     @abc.abstractmethod
     def close(
-        self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+        self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
     ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"]]:
         """Compute q and v as they are saved and read."""
 
     @abc.abstractmethod
-    def dynamics(self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
+    def dynamics(self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
         """Compute accelerations and multipliers at a saved state."""

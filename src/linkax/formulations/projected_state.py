@@ -22,12 +22,11 @@ from linkax.equations.system import System
 from linkax.formulations.formulation import linear_system
 from linkax.formulations.singular_limit import Direction, Value, singular_limit
 from linkax.formulations.tangents import Tangents, state_tangent, unbalanced_tangent
-from linkax.linalg.block_elimination import BlockInverse
+from linkax.linalg.block_elimination import Factors
 from linkax.linalg.least_multipliers import least_multipliers
-from linkax.linalg.saddle_inverse import SaddleInverse
 from linkax.linalg.while_falling import while_falling
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import positive_or_one, ratio
 from linkax.xla.tracing import jit_inline
 
@@ -37,7 +36,7 @@ ALONG = (1e-4, 1e-3, 1e-2)  # radians or lengths of the mechanism, along which r
 
 
 # Of a `TangentSpace`, which calls these functions, and a state: (method, system, t, q, v).
-Arguments = tuple[Any, System, Scalar | float, Float[Array, " n_q"], Float[Array, " n_v"]]
+Arguments = tuple[Any, System, ScalarLike, Float[Array, " n_q"], Float[Array, " n_v"]]
 
 
 class Evaluated(NamedTuple):
@@ -47,7 +46,7 @@ class Evaluated(NamedTuple):
     v: Float[Array, " n_v"]
     acceleration: Float[Array, " n_v"]
     multipliers: Float[Array, " m"]
-    split: SaddleInverse | BlockInverse
+    split: Factors
 
 
 @eqx.filter_custom_jvp
@@ -81,7 +80,7 @@ def _evaluate_jvp(primals, tangents):
 @eqx.filter_custom_jvp
 def correct(
     arguments: Arguments,
-) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], SaddleInverse | BlockInverse]:
+) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], Factors]:
     """The state on the loops next to one that is close, and the split that corrected it."""
     method, system, t, q, v = arguments
     linear = linear_system(system, t, on_manifold(system.topology, q))
@@ -119,7 +118,7 @@ def _close_jvp(primals, tangents):
 
 
 def approach(
-    method: Any, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    method: Any, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
 ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], Float[Array, ""]]:
     """Newton steps on q until the loops close to rounding or stop closing further, then v: (q, v, d)."""
     small = ROUNDING_ULPS * jnp.finfo(q.dtype).eps
@@ -141,7 +140,7 @@ def approach(
 def ranks_along(
     method: Any,
     system: System,
-    t: Scalar | float,
+    t: ScalarLike,
     q: Float[Array, " n_q"],
     v: Float[Array, " n_v"],
     rank: Int[Array, " n_islands"],
@@ -168,7 +167,7 @@ def ranks_along(
 
 
 def limit_of_acceleration(
-    method: Any, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    method: Any, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
 ) -> Float[Array, " n_v"]:
     """v̇ at a state on the loops, close to a singular configuration as a limit along the motion."""
     (_, acceleration), _ = _limit(_acceleration_at, (0, 2), method, system, t, q, v)
@@ -176,7 +175,7 @@ def limit_of_acceleration(
 
 
 def limit_of_multipliers(
-    method: Any, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    method: Any, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
 ) -> Float[Array, " m"]:
     """λ of minimum norm at a state on the loops, close to a singular configuration as a limit along the motion."""
     (_, per_inertia), _ = _limit(_multipliers_at, (0, 2), method, system, t, q, v)

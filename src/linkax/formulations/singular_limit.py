@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Float, PyTree
 
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import ratio
 from linkax.xla.primitives import bounded_while_loop
 
@@ -67,7 +67,7 @@ class Direction(NamedTuple):
     - `advances`: whether time goes on with the motion, as it must where drives prescribe it.
     """
 
-    t: Scalar | float
+    t: ScalarLike
     q: Float[Array, " n_q"]
     v: Float[Array, " n_v"]
     fastest: Float[Array, ""]

@@ -24,12 +24,18 @@ from linkax.equations.system import System
 from linkax.formulations import projected_state
 from linkax.formulations.constraint_split import AtRest, ConstraintSplit
 from linkax.formulations.formulation import AbstractFormulation, Dynamics, LinearSystem, linear_system
-from linkax.linalg.block_elimination import BlockInverse, SaddlePointInFronts, invert_by_blocks, with_identity_metric
+from linkax.linalg.block_elimination import (
+    BlockInverse,
+    Factors,
+    SaddlePointInFronts,
+    invert_by_blocks,
+    with_identity_metric,
+)
 from linkax.linalg.constrained_solve import SaddlePoint, constrained_solve
 from linkax.linalg.saddle_inverse import SaddleInverse, invert_apart, singularity_distance, with_mass
 from linkax.model.numbers import Number, number, one_of, require, whole_number
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import jit_inline
 
 Metric = Literal["mass", "identity"]
@@ -100,7 +106,7 @@ class TangentSpace(AbstractFormulation):
         """No: derivatives are those of the corrected state."""
         return False
 
-    def split(self, linear: LinearSystem) -> SaddleInverse | BlockInverse:
+    def split(self, linear: LinearSystem) -> Factors:
         """Factorise A P = Q R, front by front where that takes less."""
         if linear.configuration.system.structure.elimination is None:
             return self._split_at_once(linear)
@@ -109,7 +115,7 @@ class TangentSpace(AbstractFormulation):
     def correct_position(
         self,
         linear: LinearSystem,
-        split: SaddleInverse | BlockInverse,
+        split: Factors,
         configuration: Configuration,
         correct: bool | Bool[Array, ""] = True,
     ) -> Float[Array, " n_q"]:
@@ -123,7 +129,7 @@ class TangentSpace(AbstractFormulation):
         return retract(configuration.system.topology, configuration.q, change)
 
     def correct_velocity(
-        self, linear: LinearSystem, split: SaddleInverse | BlockInverse, v: Float[Array, " n_v"], refinements: int
+        self, linear: LinearSystem, split: Factors, v: Float[Array, " n_v"], refinements: int
     ) -> Float[Array, " n_v"]:
         """The speeds nearest to v with J v = b: v ← L⁻ᵀ [Q₂ Q₂ᵀ w + Q₁ R₁₁⁻ᵀ (Pᵀ b)ᵣ], w = Lᵀ v (paper, velocities).
 
@@ -138,7 +144,7 @@ class TangentSpace(AbstractFormulation):
     def solve_accelerations(
         self,
         linear: LinearSystem,
-        split: SaddleInverse | BlockInverse,
+        split: Factors,
         f: Float[Array, " n_v"],
         gamma: Float[Array, " m"],
         refinements: int,
@@ -155,7 +161,7 @@ class TangentSpace(AbstractFormulation):
         return constrained_solve(inverse, linear.mass, linear.jacobian, f, gamma, refinements, product)
 
     def tangential_part(
-        self, linear: LinearSystem, split: SaddleInverse | BlockInverse, change: Float[Array, " n_v"]
+        self, linear: LinearSystem, split: Factors, change: Float[Array, " n_v"]
     ) -> Float[Array, " n_v"]:
         """The part of a change that keeps the loops closed: L⁻ᵀ Q₂ Q₂ᵀ Lᵀ δ. Errors of a state have this part only."""
         product = self._saddle_point(linear, self._weight(linear), self._weight_blocks(linear))
@@ -166,7 +172,7 @@ class TangentSpace(AbstractFormulation):
         return along - split.apply(jnp.zeros_like(change), opened)[0]
 
     def least_change(
-        self, linear: LinearSystem, split: SaddleInverse | BlockInverse, rows: Float[Array, " m"], refinements: int
+        self, linear: LinearSystem, split: Factors, rows: Float[Array, " m"], refinements: int
     ) -> Float[Array, " n_v"]:
         """The smallest change δ of coordinates or speeds with J δ = rows: L⁻ᵀ Q₁ R₁₁⁻ᵀ (Pᵀ rows)ᵣ."""
         weight = self._weight(linear)
@@ -222,7 +228,7 @@ class TangentSpace(AbstractFormulation):
     def derivative(
         self,
         system: System,
-        t: Scalar | float,
+        t: ScalarLike,
         q: Float[Array, " n_q"],
         v: Float[Array, " n_v"],
         correct: bool | Bool[Array, ""],
@@ -235,7 +241,7 @@ class TangentSpace(AbstractFormulation):
     def correct(
         self,
         system: System,
-        t: Scalar | float,
+        t: ScalarLike,
         q: Float[Array, " n_q"],
         v: Float[Array, " n_v"],
         errors: tuple[Float[Array, " n_v"], ...] = (),
@@ -258,7 +264,7 @@ class TangentSpace(AbstractFormulation):
 
     @jit_inline
     def close(
-        self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+        self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
     ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"]]:
         """q and v on the manifold to rounding, from any state near it, with fresh factors."""
         if system.topology.num_rows == 0:
@@ -266,7 +272,7 @@ class TangentSpace(AbstractFormulation):
         return projected_state.close((self, system, t, q, v))
 
     @jit_inline
-    def dynamics(self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
+    def dynamics(self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
         """Accelerations and multipliers at a state on the manifold."""
         linear = linear_system(system, t, q)
         split = self.split(linear)
@@ -282,7 +288,7 @@ class TangentSpace(AbstractFormulation):
 
     @jit_inline
     def least_multipliers(
-        self, system: System, t: Scalar | float, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+        self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
     ) -> Float[Array, " m"]:
         """Multipliers of minimum norm at a state on the manifold, close to a singular configuration as a limit.
 
@@ -291,13 +297,13 @@ class TangentSpace(AbstractFormulation):
         """
         return projected_state.limit_of_multipliers(self, system, t, q, v)
 
-    def constraint_split(self, system: System, t: Scalar | float, q: Float[Array, " n_q"]) -> ConstraintSplit:
+    def constraint_split(self, system: System, t: ScalarLike, q: Float[Array, " n_q"]) -> ConstraintSplit:
         """J and its split, with a basis of the tangent space, at coordinates q."""
         linear = linear_system(system, t, q)
         return ConstraintSplit(linear.configuration, linear.jacobian, self._split_at_once(linear))
 
     def right_inverse(
-        self, system: System, t: Scalar | float, q: Float[Array, " n_q"]
+        self, system: System, t: ScalarLike, q: Float[Array, " n_q"]
     ) -> tuple[Float[Array, "m n_v"], Float[Array, "n_v m"], Float[Array, ""]]:
         """J, (m, n_v), a right inverse G of its independent rows, (n_v, m), and d at coordinates q."""
         linear = linear_system(system, t, q)
@@ -305,14 +311,14 @@ class TangentSpace(AbstractFormulation):
         column = lambda gamma: split.apply(jnp.zeros(n, gamma.dtype), gamma)[0]
         return linear.jacobian, jax.vmap(column, out_axes=1)(jnp.eye(rows, dtype=q.dtype)), split.distance
 
-    def distance(self, system: System, t: Scalar | float, q: Float[Array, " n_q"]) -> Float[Array, ""]:
+    def distance(self, system: System, t: ScalarLike, q: Float[Array, " n_q"]) -> Float[Array, ""]:
         """The distance d from the nearest singular configuration, with derivatives."""
         linear = linear_system(system, t, q)
         weight = linear.mass if self.metric == "mass" else None
         islands, ranks = system.structure.islands, self._ranks_of_islands(system)
         return singularity_distance(weight, linear.jacobian, system.scales, self.tolerance, islands, ranks)
 
-    def at_rest(self, system: System, t: Scalar | float, q: Float[Array, " n_q"]) -> AtRest:
+    def at_rest(self, system: System, t: ScalarLike, q: Float[Array, " n_q"]) -> AtRest:
         """The acceleration from rest at coordinates q, and what selects its branch."""
         linear = linear_system(system, t, q)
         split, rest = self._split_at_once(linear), jnp.zeros(system.topology.num_speeds, system.dtype)

@@ -17,7 +17,7 @@ from linkax.equations.dynamics import unbalanced_force
 from linkax.equations.loops import gamma, jacobian, rate, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import materialise, pushforward
 
 
@@ -48,7 +48,7 @@ class StateTangent(NamedTuple):
 def state_tangent(
     onto: Callable[[Array], Array] | None,
     system: System,
-    t: Scalar | float,
+    t: ScalarLike,
     q: Float[Array, " n_q"],
     v: Float[Array, " n_v"],
     tangents: Tangents,

@@ -18,11 +18,11 @@ from jaxtyping import Float, Int
 
 from linkax.linalg.elimination_plan import EliminationPlan
 from linkax.linalg.pivoted_qr import pivoted_qr
-from linkax.linalg.saddle_inverse import independent
+from linkax.linalg.saddle_inverse import SaddleInverse, independent
 from linkax.linalg.static_sparse import StaticSparse, constant_product
 from linkax.linalg.triangular import cholesky_inverse, upper_inverse
 from linkax.spatial.vectors import length
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import ratio
 
 
@@ -85,10 +85,14 @@ class BlockInverse(eqx.Module):
         return a, _gathered(found[:, added:], plan.row_table, gamma.shape[0])
 
 
+# Factors of the constrained solve, at once or front by front.
+Factors = SaddleInverse | BlockInverse
+
+
 def invert_by_blocks(
     blocks: Blocks,
     scales: Float[Array, " n"],
-    tolerance: Scalar | float,
+    tolerance: ScalarLike,
     plan: EliminationPlan,
     rank_nearby: Int[Array, " k"] | None = None,
 ) -> BlockInverse:
@@ -174,7 +178,7 @@ class _Here(NamedTuple):
 
     kept: int
     size: Float[Array, ""]
-    tolerance: Scalar | float
+    tolerance: ScalarLike
     is_known: bool
 
     def eliminate(

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.saddle_inverse import invert
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 
 
 class LeastMultipliers(NamedTuple):
@@ -26,7 +26,7 @@ def least_multipliers(
     jacobian: Float[Array, "m n"],
     multipliers: Float[Array, " m"],
     scales: Float[Array, " n"],
-    tolerance: Scalar | float,
+    tolerance: ScalarLike,
     rank: Int[Array | np.integer, ""] | int,
 ) -> LeastMultipliers:
     """The multipliers of minimum norm with the same Jᵀλ, differentiable like `constrained_solve`.

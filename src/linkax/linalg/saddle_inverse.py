@@ -18,7 +18,7 @@ from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.static_sparse import assembled
 from linkax.linalg.triangular import cholesky_inverse, cholesky_inverse_by_elimination, upper_inverse
 from linkax.spatial.vectors import length
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import positive_or_one, ratio
 from linkax.xla.tracing import jit_inline
 
@@ -61,7 +61,7 @@ def invert(
     weight: Float[Array, "n n"] | None,
     jacobian: Float[Array, "m n"],
     scales: Float[Array, " n"],
-    tolerance: Scalar | float,
+    tolerance: ScalarLike,
     rank_nearby: Int[Array | np.integer, ""] | int | None = None,
 ) -> SaddleInverse:
     """Split the space of speeds by J and invert the saddle-point system on it.
@@ -136,7 +136,7 @@ def _scaled(to_metric, jacobian):
 
 def independent(
     r: Float[Array, "n m"],
-    tolerance: Scalar | float,
+    tolerance: ScalarLike,
     rank_nearby: Int[Array | np.integer, ""] | int | None,
     largest: Float[Array, ""] | None = None,
 ) -> tuple[Bool[Array, " k"], Float[Array, ""]]:
@@ -159,7 +159,7 @@ def singularity_distance(
     weight: Float[Array, "n n"] | None,
     jacobian: Float[Array, "m n"],
     scales: Float[Array, " n"],
-    tolerance: Scalar | float,
+    tolerance: ScalarLike,
     islands: Islands,
     rank_nearby: Int[Array, " k"] | None = None,
 ) -> Float[Array, ""]:
@@ -197,7 +197,7 @@ def invert_apart(
     weight: Float[Array, "n n"] | None,
     jacobian: Float[Array, "m n"],
     scales: Float[Array, " n"],
-    tolerance: Scalar | float,
+    tolerance: ScalarLike,
     islands: Islands,
     rank_nearby: Int[Array, " k"] | None = None,
 ) -> SaddleInverse:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 
 Carry = TypeVar("Carry")
 
@@ -16,7 +16,7 @@ def while_falling(
     improve: Callable[[Carry, Array], tuple[Carry, Array]],
     begin: Carry,
     most: int,
-    small: Scalar | float,
+    small: ScalarLike,
     dtype: np.dtype,
 ) -> Carry:
     """Iterate until the residual is small, stops falling, or `most` iterations are done; at least once.

@@ -15,7 +15,7 @@ from linkax.model.forces import AbstractForce
 from linkax.model.joints.bending import BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import rotation_matrix
-from linkax.xla.arrays import Scalar
+from linkax.xla.arrays import ScalarLike
 
 
 class Parts(NamedTuple):
@@ -99,7 +99,7 @@ def _hold(beam: Beam, name: str, place: Place) -> BeamSegment:
     return _segment(beam, name, name, place.element, within)
 
 
-def _segment(beam: Beam, name: str, child: str, element: int, place: Scalar | float) -> BeamSegment:
+def _segment(beam: Beam, name: str, child: str, element: int, place: ScalarLike) -> BeamSegment:
     return BeamSegment(name, _reference(beam.nodes[element]), _reference(child), beam, element, place)
 
 

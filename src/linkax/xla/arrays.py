@@ -8,3 +8,5 @@ from jaxtyping import Float
 Array = jax.Array | np.ndarray
 # Arithmetic of NumPy's arrays without dimensions gives its scalars.
 Scalar = Float[Array | np.floating, ""]
+# And a number of Python's, which is no traced one.
+ScalarLike = Scalar | float | int

@@ -21,7 +21,7 @@ from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
 from linkax.model.terms import Term
 from linkax.spatial.rotations import compose
 from linkax.spatial.screws import exponential, screw_matrix
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, Scalar, ScalarLike
 
 
 def strain_unit(strain: int) -> str:
@@ -152,9 +152,9 @@ class BeamSegment(OnBeam):
     The one with the beam's name has the strains at all nodes as coordinates.
     """
 
-    place: Scalar | float
+    place: ScalarLike
 
-    def __init__(self, name: str, parent: Frame, child: Frame, beam: Beam, element: int, place: Scalar | float) -> None:
+    def __init__(self, name: str, parent: Frame, child: Frame, beam: Beam, element: int, place: ScalarLike) -> None:
         super().__init__(name, parent, child, beam, element)
         self.place = place
 

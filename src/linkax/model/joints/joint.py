@@ -14,7 +14,7 @@ from linkax.model.bodies import BodyOrFrame, Frame, frame_of
 from linkax.model.numbers import Axis, Constant, perpendicular_axes, require_bool, unit_axis, value
 from linkax.model.terms import Term
 from linkax.spatial.rotations import frame_about_axis, rotation_about_first_axis
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, Scalar, ScalarLike
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +156,7 @@ class AbstractJoint(eqx.Module):
         return None
 
     @property
-    def length_estimate(self) -> Scalar | float:
+    def length_estimate(self) -> ScalarLike:
         """Estimate of how far its `motion` takes the child from the parent [m]."""
         return 0.0
 

@@ -32,7 +32,7 @@ from linkax.simulation.integrate.options import (
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import all_concrete, concrete
 
 DEFAULT_FORMULATION = TangentSpace()
@@ -116,7 +116,7 @@ class Run(eqx.Module):
 
     @staticmethod
     def of_state(
-        mechanism: Mechanism, state: State, t: Scalar | float, formulation: AbstractFormulation, accuracy: Accuracy
+        mechanism: Mechanism, state: State, t: ScalarLike, formulation: AbstractFormulation, accuracy: Accuracy
     ) -> "Run":
         """What a state alone says of a run: nothing is stepped."""
         return Run(mechanism, state, t, t, formulation, accuracy, True, False, None)
