@@ -99,8 +99,7 @@ class _Moving(Nearby):
     def opens(self) -> Float[Array, ""]:
         """The largest gap of the loops, rate that speeds miss, or slope at which T opens the loops."""
         slopes = jacobian(configure(self.system, self.t, self.q)) @ self.basis
-        longest = largest(self.basis / self.system.scales[:, None])
-        apart = ratio(largest(slopes), longest)
+        apart = ratio(largest(slopes), largest(self.basis / self.system.scales[:, None]))
         misses = missed_rates(self.system, self.t, self.q, self.v)
         gap = widest_gap(self.system, self.t, self.q)
         return jnp.maximum(jnp.maximum(apart, gap), jnp.max(misses, initial=0.0))
@@ -276,7 +275,7 @@ class _Modes(NamedTuple):
 def _steadiness(moving, state, basis, modes, history) -> _Steadiness:
     """How steady a motion is, from its `history` of coefficients and gaps, see `_coefficients`."""
     system, (accelerations, stiffness, damping, opens) = moving.system, history
-    size = jnp.max(jnp.abs(modes.of_joints / system.scales[:, None]), axis=0, initial=0.0)
+    size = jax.vmap(system.fastest, in_axes=1)(modes.of_joints)
     forces = largest_force(move(configure(system, moving.t, moving.q), moving.v))
     along = jnp.abs(accelerations @ modes.vectors)
     felt = along > UNFELT * size * forces

@@ -132,8 +132,8 @@ class LoopClosure(eqx.Module):
                 self.descent(rows, slopes)[None],
             ]
             steps = jnp.concatenate(steps)
-            longest = jnp.max(jnp.abs(steps / self.system.scales), axis=1, keepdims=True, initial=0.0)
-            steps = steps * jnp.minimum(1.0, ratio(LONGEST_STEP, longest))
+            longest = jax.vmap(self.system.fastest)(steps)
+            steps = steps * jnp.minimum(1.0, ratio(LONGEST_STEP, longest))[:, None]
             changes = (STEP_FRACTIONS[:, None, None] * steps).reshape(-1, steps.shape[1])
             tries = jax.vmap(lambda change: retract(self.system.topology, q, change))(changes)
             tries = jnp.concatenate([tries, q[None]])
