@@ -1,6 +1,7 @@
 """Bad states and options are refused before anything is compiled; bad numbers in a run are told, and harm no other."""
 
 import functools
+from dataclasses import replace
 
 import diffrax
 import equinox as eqx
@@ -153,6 +154,13 @@ def test_numbers_of_the_tangent_space_in_an_accuracy_hold_and_warn():
     run = Run.of_state(MECHANISM, STATE, 0.0, checked_formulation("tangent-space", accuracy), accuracy)
     assert run.tangent_space.metric == "identity"
     assert run.tangent_space.rank_tolerance == 1e-5
+    with pytest.raises(ValueError, match=r"give them to linkax\.TangentSpace alone"):
+        lx.simulate(MECHANISM, STATE, t1=1.0, accuracy=accuracy, formulation=lx.TangentSpace())
+
+
+def test_numbers_are_replaced():
+    assert replace(lx.BALANCED, rtol=1e-6).rtol == 1e-6
+    assert replace(lx.TangentSpace(1e-5), metric="identity").rank_tolerance == 1e-5
 
 
 READERS = {

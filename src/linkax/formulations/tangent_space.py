@@ -62,7 +62,7 @@ class TangentSpace(AbstractFormulation):
     """
 
     rank_tolerance: Float[Array, ""] | None
-    rank_nearby: Int[Array, " k"] | None
+    rank_nearby: Int[Array, " k"] | None = eqx.field(init=False)
     metric: Metric = eqx.field(static=True)
     corrections: int = eqx.field(static=True)
 

@@ -36,7 +36,8 @@ class Accuracy(eqx.Module):
     atol: Scalar
     clearance: Scalar
     projection: Projection = eqx.field(static=True)
-    tangent_space: TangentSpace | None
+    rank_tolerance: Scalar | None
+    metric: Metric | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -52,15 +53,21 @@ class Accuracy(eqx.Module):
         self.atol = self.rtol if atol is None else _number("atol", atol)
         self.clearance = _number("clearance", clearance, zero=True)
         self.projection = one_of(projection, get_args(Projection), "projection")
-        self.tangent_space = None
+        self.rank_tolerance = self.metric = None
         if rank_tolerance is not None or metric is not None:
-            self.tangent_space = TangentSpace(rank_tolerance, metric="mass" if metric is None else metric)
+            given = TangentSpace(rank_tolerance, metric="mass" if metric is None else metric)
+            self.rank_tolerance, self.metric = given.rank_tolerance, given.metric
             warnings.warn(
                 "rank_tolerance and metric of linkax.Accuracy are deprecated; give "
                 "formulation=linkax.TangentSpace(rank_tolerance, metric=...) to linkax.simulate",
                 DeprecationWarning,
                 stacklevel=2,
             )
+
+    @property
+    def tangent_space(self) -> TangentSpace | None:
+        """The formulation that `rank_tolerance` and `metric` ask for; None where neither is given."""
+        return None if self.metric is None else TangentSpace(self.rank_tolerance, metric=self.metric)
 
 
 def _number(name, value, zero=False):

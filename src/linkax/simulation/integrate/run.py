@@ -178,14 +178,23 @@ class Run(eqx.Module):
 def checked_formulation(
     formulation: str | AbstractFormulation | None, accuracy: Accuracy | None = None
 ) -> AbstractFormulation:
-    """A formulation from its name, or itself; None for the paper's."""
-    if isinstance(formulation, str):
-        formulation = named_formulation(formulation)
-    formulation = DEFAULT_FORMULATION if formulation is None else formulation
+    """Return the formulation of a name, or itself; the paper's with the deprecated numbers of `accuracy`.
+
+    **Raises:** `ValueError` for an unknown name, for what is no formulation, and where an accuracy says something else.
+    """
+    given = DEFAULT_FORMULATION if formulation is None else formulation
+    formulation = named_formulation(given) if isinstance(given, str) else given
     names = "give a name, linkax.TangentSpace() or a linkax.ClassicalFormulation"
     require_type(formulation, AbstractFormulation, "formulation", names)
     deprecated = None if accuracy is None else accuracy.tangent_space
-    return deprecated if deprecated is not None and isinstance(formulation, TangentSpace) else formulation
+    if deprecated is None or not isinstance(formulation, TangentSpace):
+        return formulation
+    if isinstance(given, TangentSpace) and given is not DEFAULT_FORMULATION:
+        raise ValueError(
+            "rank_tolerance or metric is given by linkax.Accuracy, and formulation is a linkax.TangentSpace, which has "
+            "them too; give them to linkax.TangentSpace alone"
+        )
+    return deprecated
 
 
 def _filled_in(mechanism, accuracy, t0, t1, *, solver, stepsize_controller, dt0, max_steps, saveat, **others):
