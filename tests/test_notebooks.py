@@ -1,6 +1,7 @@
 """Every notebook runs from its first cell to its last, and keeps its outputs."""
 
 import json
+import re
 from pathlib import Path
 
 import matplotlib
@@ -25,9 +26,10 @@ def test_a_notebook_runs(path, monkeypatch, capsys):
         exec(compile("".join(cell["source"]), f"{path.name}, code cell {count}", "exec"), names)
         kept = [kind for output in cell["outputs"] for kind in output.get("data", {})]
         assert kept.count("image/png") == len(shown), f"code cell {count}: outputs kept"
+        told = capsys.readouterr().out
+        differences = [float(number) for number in re.findall(r"differs by (\S+)", told)]
+        assert all(difference <= 1e-12 for difference in differences), f"code cell {count}: {told}"
         printed = "".join("".join(output["text"]) for output in cell["outputs"] if output["output_type"] == "stream")
-        assert len(capsys.readouterr().out.splitlines()) == len(printed.splitlines()), (
-            f"code cell {count}: outputs kept"
-        )
+        assert len(told.splitlines()) == len(printed.splitlines()), f"code cell {count}: outputs kept"
         shown.clear()
     matplotlib.pyplot.close("all")

@@ -20,11 +20,27 @@ from linkax.equations.system import system_of
 from linkax.formulations.formulation import linear_system
 
 TOLERANCE = 1e-6
-# Scene, its settings, rank of J along the motion: Bricard's mechanism has a row too many.
+
+
+def driven():
+    """A crank-slider that a drive moves, with an arm that swings on its slider: b is not zero."""
+    mechanism, _ = start("crank-slider", "SC4", {"rod": 1.5})
+    arm = lx.rod("arm", 0.4, 2.0)
+    mechanism = lx.Mechanism(
+        [*mechanism.bodies, arm],
+        [*mechanism.joints, lx.Revolute("hinge", mechanism.body("slider"), arm.at("base"), "z")],
+        forces=mechanism.forces,
+        constraints=[lx.Drive("motor", "bearing", lambda t: 1.0 + 2.0 * t)],
+    )
+    return mechanism, lx.assemble(mechanism, positions={"hinge": 0.5}, speeds={"hinge": 1.0})
+
+
+# Mechanism and state, rank of J along the motion: Bricard's mechanism has a row too many.
 CASES = {
-    "crank-slider": ("SC4", {"speed": 2.0, "rod": 1.5}, 2),
-    "bricard": (None, {"angle": 0.3, "speed": 1.0}, 4),
-    "n-four-bar": (None, {"N": 3, "angle": 1.2}, 6),
+    "crank-slider": (lambda: start("crank-slider", "SC4", {"speed": 2.0, "rod": 1.5}), 2),
+    "bricard": (lambda: start("bricard", None, {"angle": 0.3, "speed": 1.0}), 4),
+    "n-four-bar": (lambda: start("n-four-bar", None, {"N": 3, "angle": 1.2}), 6),
+    "driven": (driven, 3),
 }
 
 
@@ -110,8 +126,8 @@ def written_out(metric, found, scales, most, q, v):
 @pytest.mark.parametrize("metric", ["identity", "mass"])
 @pytest.mark.parametrize("scene", CASES)
 def test_steps_written_out(scene, metric):
-    variant, changes, rank = CASES[scene]
-    mechanism, state = start(scene, variant, changes)
+    case, rank = CASES[scene]
+    mechanism, state = case()
     system = system_of(mechanism, float)
     scales, random = np.asarray(system.scales), np.random.default_rng(2)
     method = lx.TangentSpace(TOLERANCE, metric=metric).prepared(float, jnp.array([rank]))
@@ -132,6 +148,7 @@ def test_steps_written_out(scene, metric):
     for _ in range(3):
         q = compare(["distance", "position"])["position"]
     corrected = compare(["velocity"])["velocity"]
+    assert np.any(np.asarray(rate(system, 0.0)) != 0.0) == (scene == "driven")
     assert np.max(np.abs(corrected - v)) > 1e-3
     v = corrected
     compare(["distance", "position", "velocity", "acceleration", "reaction", "tangential"])
