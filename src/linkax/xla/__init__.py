@@ -1,4 +1,7 @@
-"""What linkax asks of XLA, and of the insides of JAX and Equinox: all of it is in this package.
+"""What linkax asks of XLA, and of the insides of JAX and Equinox.
+
+All of it is in this package, but for two names: `linalg.pivoted_qr` has a `custom_vmap` of its own, and
+`simulation.integrate.discrete_adjoint` makes a `ShapedArray`.
 
 What we rely on (where; since which version), and what happens without it:
 
@@ -10,23 +13,26 @@ What we rely on (where; since which version), and what happens without it:
   and the warning comes.
 - compiler options `xla_backend_optimization_level` and the like (`flags`; jaxlib 0.10). Without it: programs that run
   once compile twice as long.
-- `jax.monitoring`, the event before XLA compiles (`memory_maps`; jax 0.10). Without it: XLA ends a process that has
-  compiled too many programs.
-- `jax.core.Tracer` (`tracing`; jax 0.10). Without it: numbers of a model cannot be checked.
-- `jax.core.eval_context` (`tracing`; jax 0.10). Without it: known numbers inside a transformation compile as part of
-  it.
-- `jax.extend.core` Jaxpr, `dot_general_p` (`products_as_sums`; jax 0.10). Without it: products of small matrices call
-  a library: half of the speed.
-- `jax.interpreters` `ad`, `batching`, `mlir` (`cross_product`; jax 0.10). Without it: derivatives of vector products
-  take several times as many operations.
-- `jax.custom_batching.custom_vmap` (`one_kernel`, `batches`, `linalg.pivoted_qr`; jax 0.10). Without it: batches are
-  as slow as their members one by one, and LAPACK may wait for ever (`one_by_one`).
-- `equinox.internal` `create_vprim`, `filter_primitive_*` (`primitives`; equinox 0.13). Without it: no derivative in
-  both modes of a run, or of what has none.
-- `equinox.internal.while_loop(kind="bounded")` (`primitives`; equinox 0.13). Without it: limits at passages have no
-  reverse mode.
-- `_value`, `_enumeration` of Equinox's enumerations (`enumerations`; equinox 0.13). Without it: results of batches
-  cannot be counted.
+
+Without one of the following names, from jax 0.10 and equinox 0.13 on, linkax cannot be imported or fails where it is
+used. What would have to be found another way:
+
+- `jax.core.Tracer` (`tracing`): whether numbers of a model are known, and can be checked.
+- `jax.core.eval_context` (`tracing`): known numbers inside a transformation, computed without being part of it.
+- `jax.core.ShapedArray` (`cross_product`, `undefined`): shapes of what a primitive returns.
+- `jax.extend.core` Jaxpr, `dot_general_p` (`products_as_sums`): small products as sums, without which they call a
+  library at half of the speed.
+- `jax.extend.core.Primitive`, `jax.interpreters` `ad`, `batching`, `mlir` (`cross_product`): derivatives of vector
+  products, in a fraction of the operations.
+- `jax.custom_derivatives.SymbolicZero` (`derivatives`): which arguments have no tangent.
+- `jax.custom_batching.custom_vmap`, `jax.lax.platform_dependent` (`one_kernel`, `batches`): batches faster than their
+  members one by one, and without LAPACK that waits for ever (`one_by_one`).
+- `jax.monitoring`, the event before XLA compiles, and `clear_caches` of JAX and Equinox (`memory_maps`): room for
+  compiled programs, without which XLA ends a process that has compiled too many.
+- `equinox.internal` `create_vprim`, `filter_primitive_*` (`primitives`): derivatives in both modes of a run, and of
+  what has none.
+- `equinox.internal.while_loop(kind="bounded")` (`primitives`): the reverse mode of limits at passages.
+- `_value`, `_enumeration` of Equinox's enumerations (`enumerations`): counts of the results of a batch.
 
 What diffrax is given that it does not expect is in `linkax.simulation.integrate.diffrax_contract`. `.ci/versions` holds
 a short set of known answers against the lowest and the newest versions.
