@@ -80,8 +80,7 @@ class ConstraintSplit(eqx.Module):
     def along(
         self, v: Float[Array, " n_v"], from_rest: bool | Bool[Array, ""]
     ) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
-        """How far speeds v, of any size, are from a branch, and the ranks of all islands beside this configuration
-        along v.
+        """Tell how far speeds v are from a branch, and the rank of J of each island a little farther along them.
 
         **Arguments:** `from_rest`: whether v are accelerations; what drives ask for is relative to them then, not their
         square.

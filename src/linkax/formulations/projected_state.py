@@ -145,7 +145,7 @@ def ranks_along(
     v: Float[Array, " n_v"],
     rank: Int[Array, " n_islands"],
 ) -> Int[Array, " k"]:
-    """The rank of J of each front along the motion from q with speeds v, of any size; without fronts of each island.
+    """Predict the ranks of J along the motion from q with speeds v: of each front, or of each island without fronts.
 
     `rank`: of each island. Ranks of fronts show at states a little farther on; where they do not add up to it there,
     a front has as many independent rows as the tolerance says.
@@ -204,7 +204,7 @@ def _constant(tree):
 
 
 def _limit(function, powers, method, system, t, q, v):
-    """A function of (method, system, v), t and q at q, or as a limit along v."""
+    """Evaluate a function of ((method, system, v), t, q), near a singular configuration as a limit along v."""
     step = lambda q, change: retract(system.topology, q, change)
     direction = Direction(t, q, v, system.fastest(v), step, is_driven(system))
     return singular_limit(function, powers, (method, system, v), direction)

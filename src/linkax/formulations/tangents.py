@@ -53,7 +53,7 @@ def state_tangent(
     v: Float[Array, " n_v"],
     tangents: Tangents,
 ) -> StateTangent:
-    """The state nearest to one that tangents, on loops that change.
+    """Compute the tangent of a state projected onto loops that change: J dq = −dc, J dv = db − dJ v.
 
     `onto`: rows -> the smallest change of coordinates or speeds with that change of the rows J; or None, for a state
     that is taken as it is.

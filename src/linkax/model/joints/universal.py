@@ -10,8 +10,8 @@ from linkax.xla.arrays import Array
 class Universal(AbstractJoint):
     """A Cardan joint: the child turns about the parent's h¹, and then about its own h².
 
-    Coordinates: the two angles [rad], right-handed about h¹ and h². in (−π, π] where the joint
-    is cut. No pair of angles is singular.
+    Coordinates: the two angles [rad], right-handed about h¹ and h², in (−π, π] where
+    the joint is cut. No pair of angles is singular.
     """
 
     speed_units = ("rad", "rad")

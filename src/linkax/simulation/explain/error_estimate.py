@@ -41,9 +41,9 @@ def refined_run(solution: Solution, factor: Float[Array, ""]) -> Run:
 
 
 def part_of_run(solution: Solution, state: State, ts: Float[np.ndarray, " n"]) -> Run:
-    """The motion from a state at the first of some times to the last, saved there, in double precision.
+    """Make the run from `state` at ts[0] to ts[-1], saved at ts, in double precision.
 
-    By the same program where the run of the solution saves as many.
+    `ts` is padded to as many times as the solution saved, so that no new program compiles.
     """
     padded = np.pad(ts, (0, num_saves(solution) - len(ts)), mode="edge")
     run = _in_double(solution.run, state, solution.accuracy)

@@ -107,7 +107,7 @@ def meet(
 
 
 def crossed(problem: Problem, t: Float[Array, ""], y: Float[Array, " n"], sides: Sides) -> Float[Array, " n"]:
-    """Put a state on the sides of switches that it goes over to, with the derivative of when it does.
+    """Put a state on other sides of its switches; its derivative knows that the time of crossing moves.
 
     Where forces jump, a later crossing changes the motion after it: (f₋ − f₊) dt, with dt = −dg / ġ for a
     switch g (the saltation matrix; Leine and Nijmeijer (2004), Dynamics and Bifurcations of Non-Smooth Mechanical

@@ -26,7 +26,7 @@ FEW = 1.5e7  # times of all members, times the square of unknowns: reading more,
 
 
 def read_in_motion(function: Callable[..., Any], solution: Solution, *details: Any) -> Any:
-    """`read` of a function that needs accelerations or multipliers, for which all such share a program."""
+    """Read a function that needs v̇ or λ: these are solved by one program for all such functions, and passed in."""
     return read(function, solution, *details, dynamics=read(Observables.solve, solution))
 
 
