@@ -44,7 +44,7 @@ class Balanced(Nearby):
         return Balanced(system, method, t, q, basis, basis.T / system.scales**2)
 
     def motion(self, y: Float[Array, " n_v"]) -> tuple[Motion, ConstraintSplit]:
-        """The motion at y, v as drives ask and else as small as the loops allow, and the constraints there."""
+        """The motion at q ⊕ T y with the smallest v that has J v = b, and the split there."""
         zero = jnp.zeros_like(self.system.scales)
         q, v, *_ = self.method.correct(self.system, self.t, self.at(y), zero)
         split = self.method.constraint_split(self.system, self.t, q)
@@ -130,9 +130,9 @@ def search_downhill(
 
 
 @search_downhill.def_jvp
-def _jvp(primals, changes):
+def _jvp(primals, tangents):
     """Derivatives, to any order, of the coordinates at which the forces balance; those of the search do not matter."""
-    (system, t, begin), (system_change, t_change, _) = primals, changes
+    (system, t, begin), (system_change, t_change, _) = primals, tangents
     q, search = search_downhill(system, t, begin)
     here = Balanced.of(system, STATICS.prepared(system.dtype), t, q)
     zero = jnp.zeros(system.topology.num_speeds, system.dtype)

@@ -21,9 +21,9 @@ def _spectrum(matrix):
 
 
 @_spectrum.defjvp
-def _spectrum_jvp(primals, changes):
+def _spectrum_jvp(primals, tangents):
     values, vectors = _spectrum(*primals)
-    rotated = jnp.linalg.solve(vectors, changes[0].astype(vectors.dtype) @ vectors)
+    rotated = jnp.linalg.solve(vectors, tangents[0].astype(vectors.dtype) @ vectors)
     apart = values[None, :] - values[:, None] + jnp.eye(len(values), dtype=values.dtype)
     mixed = jnp.where(jnp.eye(len(values), dtype=bool), 0.0, rotated / apart)
     return (values, vectors), (jnp.diagonal(rotated), vectors @ mixed)

@@ -96,9 +96,9 @@ def system_of(mechanism: Mechanism, dtype: DTypeLike, fixed_scales: bool = True)
     center_of_mass = stack([body.center_of_mass for body in mechanism.bodies], (3,))
     fixed = lax.stop_gradient if fixed_scales else lambda array: array
     bends = np.array([joint.kind.motion is not None for joint in joints], dtype=bool)
-    reach = stack([joint.length_estimate for joint in joints], ()) if np.any(bends) else None
+    bent = stack([joint.length_estimate for joint in joints], ()) if np.any(bends) else None
     ends = fixed(parent_offset), fixed(child_offset)
-    loop_length, length = _lengths(topology, *ends, fixed(center_of_mass), reach)
+    loop_length, length = _lengths(topology, *ends, fixed(center_of_mass), bent)
     coupling = _coupling(mechanism, dtype)
     slides = jnp.where(topology.slides, length, jnp.ones((), dtype))
     return System(

@@ -66,7 +66,7 @@ _accelerate = one_by_one(lambda acceleration, *equations: acceleration(*equation
 _right_inverse = one_by_one(lambda correction, mass, jacobian: correction.right_inverse(mass, jacobian))
 
 
-def _in_units(at: LinearSystem):
+def _in_scales(at: LinearSystem):
     """M and J for speeds in radians and lengths of the mechanism."""
     scales = at.configuration.system.scales
     return at.mass * scales[:, None] * scales, at.jacobian * scales
@@ -116,7 +116,7 @@ class ClassicalFormulation(AbstractFormulation):
         """Solve for v̇ and λ, and for what v̇ violates of the rows without stabilisation."""
         system, motion = at.configuration.system, move(at.configuration, v)
         force, right, scales = generalised_force(motion), gamma(motion), system.scales
-        mass, rows = _in_units(at)
+        mass, rows = _in_scales(at)
         if system.topology.num_rows == 0:
             return Dynamics(scales * _solve(mass, scales * force), right, right)
         open_, rate_open = residual(at.configuration), at.jacobian @ v - rate(system, at.configuration.t)
@@ -154,7 +154,7 @@ class ClassicalFormulation(AbstractFormulation):
 
         def inverse(q):
             at = linear_system(system, t, q)
-            return at, system.scales[:, None] * _right_inverse(self.correction, *_in_units(at))
+            return at, system.scales[:, None] * _right_inverse(self.correction, *_in_scales(at))
 
         def closer(_, q):
             at, back = inverse(q)

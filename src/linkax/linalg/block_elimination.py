@@ -98,12 +98,12 @@ def invert_by_blocks(
 ) -> BlockInverse:
     """Invert like `linkax.linalg.saddle_inverse.invert`, front by front; `rank_nearby` of each front, (k,)."""
     blocks, scales = lax.stop_gradient((blocks, scales))
-    kept_unit, added_unit = (_read(scales, table) for table in (plan.separator_table, plan.interior_table))
+    kept_scales, added_scales = (_read(scales, table) for table in (plan.separator_table, plan.interior_table))
     absent = jnp.asarray(plan.interior_table < 0, scales.dtype)
     blocks = Blocks(
-        rows=blocks.rows * jnp.concatenate([kept_unit, added_unit], axis=1)[:, None, :],
-        coupling=blocks.coupling * kept_unit[:, :, None] * added_unit[:, None, :],
-        own=blocks.own * added_unit[:, :, None] * added_unit[:, None, :] + jax.vmap(jnp.diag)(absent),
+        rows=blocks.rows * jnp.concatenate([kept_scales, added_scales], axis=1)[:, None, :],
+        coupling=blocks.coupling * kept_scales[:, :, None] * added_scales[:, None, :],
+        own=blocks.own * added_scales[:, :, None] * added_scales[:, None, :] + jax.vmap(jnp.diag)(absent),
     )
     dtype, (fronts, rows, width), kept = scales.dtype, blocks.rows.shape, blocks.coupling.shape[1]
     known = jnp.full(fronts, min(rows, width)) if rank_nearby is None else rank_nearby
@@ -256,7 +256,7 @@ def _times(matrices, vectors):
 
 
 def _definite(metric, size):
-    """L⁻¹ of a metric L Lᵀ, and the smallest of L's squared diagonal over what no loss would leave."""
+    """L⁻¹ of a metric L Lᵀ, and min L_kk² / size_k: one without cancellation, zero for a singular metric."""
     root, diagonal = cholesky_inverse(metric)
     return root, jnp.min(ratio(diagonal**2, size, 0.0), initial=1.0)
 

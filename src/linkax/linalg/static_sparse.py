@@ -26,20 +26,20 @@ def constant_product(matrix: Shaped[np.ndarray, "k n"], values: Float[Array, "n 
         found = jnp.asarray(matrix, values.dtype) @ flat
     else:
         # The nonzero entries of each row first, filled up with zeros.
-        places = np.argsort(matrix == 0.0, axis=1, kind="stable")[:, :width]
-        factors = jnp.asarray(np.take_along_axis(matrix, places, axis=1), values.dtype)
-        found = jnp.sum(factors[:, :, None] * flat[places], axis=1)
+        columns = np.argsort(matrix == 0.0, axis=1, kind="stable")[:, :width]
+        factors = jnp.asarray(np.take_along_axis(matrix, columns, axis=1), values.dtype)
+        found = jnp.sum(factors[:, :, None] * flat[columns], axis=1)
     return found.reshape(len(matrix), *values.shape[1:])
 
 
 class StaticSparse(NamedTuple):
     """A matrix by its entries that may differ from zero.
 
-    - `values`: (k,). `places`: for each entry of the matrix 1 + its index in `values`, 0 for a zero.
+    - `values`: (k,). `indices`: for each entry of the matrix 1 + its index in `values`, 0 for a zero.
     """
 
     values: Float[Array, " k"]
-    places: np.ndarray
+    indices: np.ndarray
 
     @staticmethod
     def whole(matrix: Float[Array, "m n"]) -> "StaticSparse":
@@ -50,13 +50,13 @@ class StaticSparse(NamedTuple):
     def stacked(parts: "list[StaticSparse]") -> "StaticSparse":
         """Stack the rows of several matrices."""
         first = np.cumsum([0, *(len(part.values) for part in parts)])
-        places = [part.places + start * (part.places > 0) for part, start in zip(parts, first, strict=False)]
-        return StaticSparse(jnp.concatenate([part.values for part in parts]), np.concatenate(places))
+        indices = [part.indices + start * (part.indices > 0) for part, start in zip(parts, first, strict=False)]
+        return StaticSparse(jnp.concatenate([part.values for part in parts]), np.concatenate(indices))
 
     def at(self, down: Int[np.ndarray, "..."] | slice, across: Int[np.ndarray, "..."] | slice) -> Float[Array, "..."]:
         """Read entries, indexed as in NumPy."""
         nothing = jnp.zeros(1, self.values.dtype)
-        return jnp.concatenate([nothing, self.values])[self.places[down, across]]
+        return jnp.concatenate([nothing, self.values])[self.indices[down, across]]
 
     def dense(self) -> Float[Array, "m n"]:
         """Read all entries."""
@@ -69,13 +69,13 @@ def products_of_pairs(
     """The matrix of aᵢ · bⱼ, vectors (k, d) and (n, d), i in `left` and j in `right`; zero where i is −1."""
     present = left >= 0
     pairs, source = np.unique((left * len(b) + right)[present], return_inverse=True)
-    places = np.zeros(left.shape, dtype=int)
+    indices = np.zeros(left.shape, dtype=int)
     if _is_worth_it(len(pairs), len(a) * len(b)):
         down, across = np.divmod(pairs, len(b))
-        places[present] = 1 + source
-        return StaticSparse(jnp.sum(a[down] * b[across], axis=-1), places)
-    places[present] = 1 + pairs[source]
-    return StaticSparse(jnp.ravel(a @ b.T), places)
+        indices[present] = 1 + source
+        return StaticSparse(jnp.sum(a[down] * b[across], axis=-1), indices)
+    indices[present] = 1 + pairs[source]
+    return StaticSparse(jnp.ravel(a @ b.T), indices)
 
 
 def _is_worth_it(read, entries):

@@ -46,7 +46,7 @@ STIFFNESSES = ("torsional_stiffness", *2 * ("bending_stiffness",), "axial_stiffn
 PLACED = 1e-9  # rounding of places at the ends of an element, in its lengths
 
 
-class Place(Frame):
+class FrameOnBeam(Frame):
     """A frame on the section at offset[0] [m] of the beam named `body`.
 
     - `element`: the element that this section is in, from 0.
@@ -155,12 +155,12 @@ class Beam(AbstractBody):
         offset = offset * np.eye(3)[0] if offset.shape == () else offset
         if element is not None:
             whole_number(element, f"{what}: element", least=0, most=self.elements - 1)
-            return Place(self.name, self.within(offset, what, element, element + 1), axes, int(element))
+            return FrameOnBeam(self.name, self.within(offset, what, element, element + 1), axes, int(element))
         along = concrete(offset[0] / self.element_length)
         if along is None:
             raise ValueError(f"{what} is traced by JAX; say which element it is in: beam.at(..., element=0)")
         element = int(np.clip(np.floor(along), 0, self.elements - 1))
-        return Place(self.name, self.within(offset, what), axes, element)
+        return FrameOnBeam(self.name, self.within(offset, what), axes, element)
 
     def within(self, offset: Array, what: str, first: int = 0, last: int | None = None) -> Float[Array, "3"]:
         """Check that a place [x, y, z] is between two nodes, by default the base and the tip."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from linkax.model.beams import MASS_PLACES, Beam, BeamElasticity, Place
+from linkax.model.beams import MASS_PLACES, Beam, BeamElasticity, FrameOnBeam
 from linkax.model.bodies import Frame, RigidBody
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
@@ -19,7 +19,7 @@ from linkax.xla.arrays import ScalarLike
 
 
 class Parts(NamedTuple):
-    """The parts of a mechanism, with beams taken apart."""
+    """The parts of a mechanism, with beams cut into segments and nodes."""
 
     bodies: list[RigidBody]
     joints: list[AbstractJoint]
@@ -47,7 +47,7 @@ def discretise_beams(
 
     def on_station(part: Any) -> Any:
         """Replace a place on a beam by a frame on a massless body that is held there; keep other parts."""
-        if not (isinstance(part, Place) and part.body in beams):
+        if not (isinstance(part, FrameOnBeam) and part.body in beams):
             return part
         name = f"{part.body}({sum(body.name.startswith(part.body + '(') for body in stations) + 1})"
         stations.append(RigidBody(name, 0.0))
@@ -93,7 +93,7 @@ def _segments(beam: Beam) -> list[BeamSegment]:
     return joints
 
 
-def _hold(beam: Beam, name: str, place: Place) -> BeamSegment:
+def _hold(beam: Beam, name: str, place: FrameOnBeam) -> BeamSegment:
     """Make the joint that holds a massless body at a place on the axis."""
     within = place.offset[0] / beam.element_length - place.element
     return _segment(beam, name, name, place.element, within)

@@ -122,7 +122,7 @@ def whole_number(entry: Any, what: str, least: int = 1, most: int = MOST) -> int
 
 
 def require_bool(entry: Any, what: str) -> bool:
-    """Check a flag: True or False."""
+    """Check that an entry is True or False."""
     if not isinstance(entry, bool | np.bool_):
         raise ValueError(f"{what} is {entry!r}; give True or False")
     return bool(entry)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from linkax.plotting.colours import BLUE, GREEN, INK, VERMILION
-from linkax.plotting.scenery import Place
+from linkax.plotting.scenery import BodyPoint
 from linkax.simulation.read.solution import Solution
 
 COMPONENT_COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
@@ -16,7 +16,7 @@ NEGLIGIBLE = 1e-9  # size of a component, relative to the largest, up to which i
 SMALLEST_VIOLATION = 1e-17  # drawn in place of zero, which has no logarithm
 
 
-def plot_point_motion(solution: Solution, body: str, at: Place = None, name: str | None = None) -> Figure:
+def plot_point_motion(solution: Solution, body: str, at: BodyPoint = None, name: str | None = None) -> Figure:
     """Plot displacement [m], velocity [m/s] and acceleration [m/s²] of a point against time [s], along ground axes.
 
     Components in which the point does not move are left out.

@@ -101,7 +101,7 @@ def simulate(
     )
     outcome = integrate_run(run)
     solution = Solution.of_run(run, outcome)
-    if all_concrete((outcome.found, outcome.end, outcome.saved)):
+    if all_concrete((outcome.integrated, outcome.end, outcome.saved)):
         if result_name(solution.result) not in ENDED_WELL:
             if throw:
                 raise _failure(solution)

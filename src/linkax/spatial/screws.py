@@ -40,8 +40,8 @@ def _series(order: int, x: Float[Array, "*batch"]) -> Float[jax.Array, "*batch 2
 
 
 @_series.defjvp
-def _series_jvp(order, primals, changes):
-    (x,), (change,) = primals, changes
+def _series_jvp(order, primals, tangents):
+    (x,), (change,) = primals, tangents
     return _series(order, x), _series(order + 1, x) * change[..., None]
 
 

@@ -201,12 +201,12 @@ def _check_start(loss, smooth):
 class _Checkpoint(NamedTuple):
     """A file with all that a search needs to go on.
 
-    - `names`: of the parameters. `identity`: fingerprint of the step's program and its numbers.
+    - `names`: of the parameters. `fingerprint`: of the step's program and its numbers.
     """
 
     path: Path
     names: list[str]
-    identity: str
+    fingerprint: str
 
     @staticmethod
     def of(
@@ -222,7 +222,7 @@ class _Checkpoint(NamedTuple):
 
     def save(self, tree: Any, losses: list[float], waited: int) -> None:
         """Write the arrays of `tree`, the losses, and the number of steps that gained nothing."""
-        header = json.dumps({"names": self.names, "fit": self.identity, "losses": losses, "waited": waited})
+        header = json.dumps({"names": self.names, "fit": self.fingerprint, "losses": losses, "waited": waited})
         leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array))
         arrays: dict[str, Any] = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
         with written_whole(self.path) as file, open(file, "wb") as stream:
@@ -242,7 +242,7 @@ class _Checkpoint(NamedTuple):
         except (AttributeError, EOFError, KeyError, OSError, ValueError, zipfile.BadZipFile) as error:
             other = f"checkpoint {str(self.path)!r} holds something else than a fit"
             raise ValueError(f"{other}; give another file, or remove this one") from error
-        if header.get("fit") != self.identity:
+        if header.get("fit") != self.fingerprint:
             raise ValueError(
                 f"checkpoint {str(self.path)!r} holds another fit, of {', '.join(header['names'])} (parameters, their "
                 "start or bounds, the data, the function, the optimiser or versions have changed); give another file, "

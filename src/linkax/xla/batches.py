@@ -33,7 +33,7 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
         return found, jax.tree.map(lambda _: True, found)
 
     differentiable = jax.custom_jvp(single)
-    differentiable.defjvp(lambda primals, changes: jax.jvp(function, primals, changes))
+    differentiable.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
     return differentiable
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from linkax.xla.arrays import Array
 
-Found = TypeVar("Found")
+Output = TypeVar("Output")
 
 
 def positive_or_one(b: Float[Array, "*shape"]) -> Float[jax.Array, "*shape"]:
@@ -36,9 +36,9 @@ def materialise(primal: Array | np.floating | float, change: Array | None) -> Ar
     return jnp.zeros_like(primal) if change is None else change
 
 
-def pushforward(function: Callable[..., Found], primals: tuple, changes: tuple) -> tuple[Found, Any]:
+def pushforward(function: Callable[..., Output], primals: tuple, tangents: tuple) -> tuple[Output, Any]:
     """Compute a function and its JVP, like `equinox.filter_jvp`, but with zeros where that gives None."""
-    found, change = eqx.filter_jvp(function, primals, changes)
+    found, change = eqx.filter_jvp(function, primals, tangents)
     numbers, _ = eqx.partition(found, eqx.is_inexact_array)
     return found, jax.tree.map(materialise, numbers, change)
 
@@ -54,8 +54,8 @@ def whole_jacobian(function: Callable[..., Any]) -> Callable[..., Any]:
     def whole(static, *arrays):
         return function(static, *arrays)
 
-    def rule(static, arrays, changes):
-        moves = [type(change) is not jax.custom_derivatives.SymbolicZero for change in changes]
+    def rule(static, arrays, tangents):
+        moves = [type(change) is not jax.custom_derivatives.SymbolicZero for change in tangents]
         moving = lambda values: [value for value, of in zip(values, moves, strict=True) if of]
         at, restored = ravel_pytree(moving(arrays))
 
@@ -64,7 +64,7 @@ def whole_jacobian(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(static, *(next(moved) if of else array for array, of in zip(arrays, moves, strict=True)))
 
         slopes = jax.vmap(lambda change: jax.jvp(of_moving, (at,), (change,))[1])(jnp.eye(len(at), dtype=at.dtype))
-        change = ravel_pytree(moving(changes))[0]
+        change = ravel_pytree(moving(tangents))[0]
         return function(static, *arrays), jax.tree.map(lambda slope: jnp.tensordot(change, slope, 1), slopes)
 
     whole.defjvp(rule, symbolic_zeros=True)

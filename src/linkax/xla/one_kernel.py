@@ -15,7 +15,7 @@ from linkax.xla.flags import makes_kernels_of_loops
 from linkax.xla.products_as_sums import with_products_as_sums
 from linkax.xla.tracing import jit_inline
 
-Found = TypeVar("Found")
+Output = TypeVar("Output")
 
 
 def in_one_kernel(
@@ -78,7 +78,7 @@ def _undefined(shape):
     return jnp.full(shape.shape, jnp.nan if jnp.issubdtype(shape.dtype, jnp.inexact) else 0, shape.dtype)
 
 
-def where_finite(function: Callable[[Array], Found], array: Float[Array, "..."], otherwise: Found) -> Found:
+def where_finite(function: Callable[[Array], Output], array: Float[Array, "..."], otherwise: Output) -> Output:
     """Compute function(array) as a branch of its own where the array is finite; elsewhere return `otherwise`.
 
     The branch is for speed: XLA runs a computation on the CPU without the cost of scheduling its parts (half of the

@@ -13,12 +13,12 @@ from jax.extend.core.primitives import dot_general_p
 
 from linkax.xla.flags import makes_kernels_of_loops
 
-Found = TypeVar("Found")
+Output = TypeVar("Output")
 
 FEW_MULTIPLICATIONS = 2**12  # which take no longer as a sum than a library takes
 
 
-def with_products_as_sums(function: Callable[..., Found]) -> Callable[..., Found]:
+def with_products_as_sums(function: Callable[..., Output]) -> Callable[..., Output]:
     """Decorate a function of arrays: replace its products of small matrices by sums, where loops are kernels.
 
     XLA leaves products of matrices on a CPU to a library, which the kernel of a loop cannot call (jaxlib 0.12).

@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 
 from linkax.xla.flags import quickest_to_compile
 
-Found = TypeVar("Found")
+Output = TypeVar("Output")
 
 jit_inline = eqx.filter_jit
 
@@ -51,13 +51,13 @@ class Program:
         return partial(evaluate_now, self._quick()) if quick and all_concrete(args) else self.optimised
 
 
-def quick_compile(function: Callable[..., Found]) -> Callable[..., Found]:
+def quick_compile(function: Callable[..., Output]) -> Callable[..., Output]:
     """Decorate a function that seldom runs more than once on the same kind of arguments, see `Program`."""
     program = Program(function)
     return wraps(function)(lambda *args: program.choose(True, *args)(*args))
 
 
-def evaluate_now(function: Callable[..., Found], *args: Any) -> Found:
+def evaluate_now(function: Callable[..., Output], *args: Any) -> Output:
     """Compute function(*args) of concrete arguments at once, also while a transformation is tracing."""
     # Not `jax.ensure_compile_time_eval`: with it JAX compiles each operation on constants by itself.
     with eval_context():

@@ -29,8 +29,8 @@ def undefined_where(undefined: PyTree[Bool[Array, "..."]], values: PyTree[Array]
 
 
 @undefined_where.def_jvp
-def _undefined_where_jvp(primals, changes):
-    (undefined, values, _), (_, to_values, to_inputs) = primals, changes
+def _undefined_where_jvp(primals, tangents):
+    (undefined, values, _), (_, to_values, to_inputs) = primals, tangents
     to_values, restored = ravel_pytree(jax.tree.map(materialise, values, to_values))
     undefined, _ = ravel_pytree(jax.tree.map(lambda none, of: jnp.broadcast_to(none, of.shape), undefined, values))
     # What all inputs have in common: through it their cotangents are reached. Of a batch, all of it is one.
@@ -47,8 +47,8 @@ def _abstract(undefined, linear):
     return ShapedArray(undefined.shape, linear.dtype)
 
 
-def _jvp(primals, changes):
-    (undefined, linear), (_, change) = primals, changes
+def _jvp(primals, tangents):
+    (undefined, linear), (_, change) = primals, tangents
     return _spoil(undefined, linear), _spoiled(undefined, change)
 
 

@@ -45,7 +45,7 @@ class Integrator(eqx.Module):
     max_steps: int | None = eqx.field(static=True)
 
 
-class Found(NamedTuple):
+class Integrated(NamedTuple):
     """What an integration leaves: times and values saved, those at its end, and how it ended.
 
     `closest`, `average`: the smallest and the mean distance from a singular configuration.
@@ -71,10 +71,10 @@ def has_discrete_adjoint(
     return plain and explicit and event is None and max_steps is not None
 
 
-def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bool) -> tuple[Found, Steps | None]:
+def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bool) -> tuple[Integrated, Steps | None]:
     """Solve an initial value problem; what derivatives there are, are those of diffrax's adjoint.
 
-    **Returns:** a `Found`, and its `Steps` if they are to be tracked, else None.
+    **Returns:** an `Integrated`, and its `Steps` if they are to be tracked, else None.
     """
     end, steps = diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t0=True, steps=True)
     saveat = integrator.saveat
@@ -86,7 +86,7 @@ def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bo
         ((saveat.subs, end, steps) if track else (saveat.subs, end), True),
         is_leaf=lambda leaf: leaf is None,
     )
-    found: Any = diffrax.diffeqsolve(
+    solution: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
         integrator.solver,
         ivp.t0,
@@ -102,12 +102,12 @@ def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bo
         throw=False,
         progress_meter=integrator.progress_meter,
     )
-    (ts, t_end, *times), (ys, y_end, *states) = found.ts, found.ys
+    (ts, t_end, *times), (ys, y_end, *states) = solution.ts, solution.ys
     average = lax.stop_gradient(diffrax_contract.integral_of_distance(y_end[0]) / (t_end[0] - ivp.t0))
-    closest = diffrax_contract.closest(found)
-    tracked = Steps(times[0], states[0], found.stats["num_accepted_steps"]) if track else None
-    end = t_end[0], y_end[0], found.stats, found.result
-    return Found(ts, ys, *end, closest, average, found.interpolation), tracked
+    closest = diffrax_contract.closest(solution)
+    tracked = Steps(times[0], states[0], solution.stats["num_accepted_steps"]) if track else None
+    end = t_end[0], y_end[0], solution.stats, solution.result
+    return Integrated(ts, ys, *end, closest, average, solution.interpolation), tracked
 
 
 # The same with the derivatives of `tangents_over_steps`, in both modes: of `ts`, `t_end`, `ys` and `y_end`.
@@ -118,7 +118,7 @@ integrate = eqx.filter_custom_jvp(solve_by_diffrax)
 def _integrate_jvp(primals, tangents):
     """The tangents of states, and of tracked steps, which derivatives of cotangents need."""
     (ivp, integrator, track), (tangents, *_) = primals, tangents
-    found, steps = integrate(ivp, integrator, True)
+    integrated, steps = integrate(ivp, integrator, True)
     # In one array, which is one of a batch where anything is: JAX could not transpose a batch with parts in common.
     flat, restored = ravel_pytree(tangents)
     flat = flat + (steps.count < 0)
@@ -126,18 +126,18 @@ def _integrate_jvp(primals, tangents):
     begin, end = materialise(ivp.t0, tangents.t0), materialise(ivp.t1, tangents.t1)
     saved = None if ivp.saved is None else materialise(ivp.saved, tangents.saved)
     row_by_row = lambda *parts: _rows(integrator.saveat.subs, *parts)
-    nothing = jax.tree.map(lambda _: None, found)
-    to_found = nothing._replace(
+    nothing = jax.tree.map(lambda _: None, integrated)
+    to_integrated = nothing._replace(
         ts=row_by_row(begin, saved, end),
         # The end's time is t1, unless the integration ended before.
-        t_end=jnp.where(found.t_end == ivp.t1, end, 0.0),
+        t_end=jnp.where(integrated.t_end == ivp.t1, end, 0.0),
         ys=row_by_row(materialise(ivp.y0, tangents.y0), trajectory.saved, trajectory.end),
         y_end=trajectory.end,
     )
     if not track:
-        return (found, None), (to_found, None)
+        return (integrated, None), (to_integrated, None)
     to_times = jnp.zeros_like(steps.ts).at[steps.count].set(end).at[0].set(begin)
-    return (found, steps), (to_found, Steps(to_times, trajectory.steps, None))
+    return (integrated, steps), (to_integrated, Steps(to_times, trajectory.steps, None))
 
 
 def _rows(sub, y0, saved, end):
@@ -172,9 +172,9 @@ def _transpose(inputs, cotangent):
         raise NotImplementedError(NO_REVERSE)
     tangents = jax.eval_shape(restored, flat.aval)
     wanted = jax.tree.map(lambda tangent: tangent is not None, tangents, is_leaf=lambda leaf: leaf is None)
-    found, _ = ravel_pytree(cotangents_over_steps(solver, ivp, steps, wanted, cotangent))
+    flat, _ = ravel_pytree(cotangents_over_steps(solver, ivp, steps, wanted, cotangent))
     none = lambda tree: jax.tree.map(lambda _: None, tree)
-    return none(solver), none(every), none(ivp), none(steps), None, found
+    return none(solver), none(every), none(ivp), none(steps), None, flat
 
 
 _tangents = primitive("discrete_adjoint", _evaluate, _abstract, _jvp, _transpose)

@@ -14,7 +14,7 @@ from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
-from linkax.simulation.integrate.discrete_adjoint import Found, Integrator, integrate, solve_by_diffrax
+from linkax.simulation.integrate.discrete_adjoint import Integrated, Integrator, integrate, solve_by_diffrax
 from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.options import saved_times
 from linkax.simulation.integrate.problem import Problem
@@ -32,10 +32,10 @@ from linkax.xla.undefined import undefined_where
 
 
 class Outcome(NamedTuple):
-    """What a run leaves: the check of its start, what was found, and states on the loops at the end and as saved."""
+    """What a run leaves: the check of its start, the integration, and states on the loops at the end and as saved."""
 
     initial: InitialCheck
-    found: Found
+    integrated: Integrated
     end: State
     saved: State | None
 
@@ -45,11 +45,11 @@ def integrate_run(run: Run) -> Outcome:
     initial = _check_start(run.mechanism, run.state, run.t0, run.tangent_space)
     if concrete(sound := sound_numbers(run.mechanism)) is None:
         initial = initial.of_numbers(sound)
-    found = _integrate.choose(run.quick, run, initial)(run, initial)
+    integrated = _integrate.choose(run.quick, run, initial)(run, initial)
     saveat: Any = run.options.saveat
-    given = (found.ts, found.t_end), (found.ys, found.y_end), saves_states(saveat), _firsts(run)
+    given = (integrated.ts, integrated.t_end), (integrated.ys, integrated.y_end), saves_states(saveat), _firsts(run)
     given = run.mechanism, run.formulation, run.accuracy, initial, *given
-    return Outcome(initial, found, *_closed.choose(run.quick, *given)(*given))
+    return Outcome(initial, integrated, *_closed.choose(run.quick, *given)(*given))
 
 
 @quick_compile
@@ -68,7 +68,7 @@ def problem_of(
 
 
 @Program
-def _integrate(run: Run, initial: InitialCheck) -> Found:
+def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     dtype = initial.state.q.dtype
     formulation, t0, t1, options, control = cast((run.formulation, run.t0, run.t1, run.options, run.control), dtype)
     in_order, t0, t1, dt0, saveat = _in_order(t0, t1, options.dt0, options.saveat)
@@ -85,9 +85,9 @@ def _integrate(run: Run, initial: InitialCheck) -> Found:
     integrator = Integrator(dt0, saveat, solver, control, run.adjoint, event, meter, options.max_steps)
     saved = saveat.subs.ts if run.has_discrete_adjoint else None
     solve = integrate if run.has_discrete_adjoint else solve_by_diffrax
-    found, _ = solve(InitialValueProblem(problem, y0, t0, t1, saved), integrator, False)
-    found = found._replace(result=_result(found.result, initial, in_order, control.is_adaptive))
-    return _without_derivatives(found, event, inputs)
+    integrated, _ = solve(InitialValueProblem(problem, y0, t0, t1, saved), integrator, False)
+    integrated = integrated._replace(result=_result(integrated.result, initial, in_order, control.is_adaptive))
+    return _without_derivatives(integrated, event, inputs)
 
 
 def _in_order(
@@ -149,15 +149,17 @@ def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptiv
     return RESULTS.where(in_order, result, RESULTS.times_out_of_order)
 
 
-def _without_derivatives(found: Found, event, inputs) -> Found:
+def _without_derivatives(integrated: Integrated, event, inputs) -> Integrated:
     """The same without derivatives where the run failed, or ended with a step that an event ended."""
-    failed = jnp.logical_not(jnp.stack([found.result == getattr(RESULTS, name) for name in ENDED_WELL]).any())
+    failed = jnp.logical_not(jnp.stack([integrated.result == getattr(RESULTS, name) for name in ENDED_WELL]).any())
     at_end = failed
     if event is not None and event.root_finder is None:
-        at_end = failed | (found.result == RESULTS.event_occurred)
-    of_times = lambda ts: failed | (at_end & (ts >= found.t_end))
+        at_end = failed | (integrated.result == RESULTS.event_occurred)
+    of_times = lambda ts: failed | (at_end & (ts >= integrated.t_end))
     of_values = lambda ts, ys: jax.tree.map(lambda y: of_times(ts).reshape(-1, *(1,) * (y.ndim - 1)), ys)
-    values, fixed = eqx.partition((found.ts, found.ys, found.t_end, found.y_end), eqx.is_inexact_array)
+    values, fixed = eqx.partition(
+        (integrated.ts, integrated.ys, integrated.t_end, integrated.y_end), eqx.is_inexact_array
+    )
     undefined = (
         jax.tree.map(of_times, values[0]),
         jax.tree.map(of_values, values[0], values[1]),
@@ -166,7 +168,7 @@ def _without_derivatives(found: Found, event, inputs) -> Found:
     )
     values = undefined_where(undefined, values, eqx.filter(inputs, eqx.is_inexact_array))
     ts, ys, t_end, y_end = eqx.combine(values, fixed)
-    return found._replace(ts=ts, ys=ys, t_end=t_end, y_end=y_end)
+    return integrated._replace(ts=ts, ys=ys, t_end=t_end, y_end=y_end)
 
 
 def _firsts(run):

@@ -91,7 +91,7 @@ class Samples(NamedTuple):
         return self.taken(np.stack([before, before + 1], axis=1))
 
 
-class _Found(NamedTuple):
+class _Passage(NamedTuple):
     """A passage: its time, the coordinates there, and the error of the time."""
 
     time: float
@@ -120,7 +120,7 @@ def singular_states(solution: Solution) -> tuple[Float[np.ndarray, " n"], Float[
     return np.array([passage.time for passage in found]), states
 
 
-def _passages(solution) -> list[_Found]:
+def _passages(solution) -> list[_Passage]:
     """Find all passages, in order.
 
     J at one state times the right inverse of J at the one before has eigenvalues near one; an eigenvalue that is
@@ -147,7 +147,7 @@ def _passages(solution) -> list[_Found]:
     different = vanished[_apart(times[vanished], together)]
     precise = PRECISE * np.ptp(samples.ts)
     found = [
-        _Found(float(times[k]), states[k], float(missed[k]))
+        _Passage(float(times[k]), states[k], float(missed[k]))
         if missed[k] <= precise
         else _polished(solution, pairs.taken(k), times[k], states[k])
         for k in different
@@ -187,11 +187,11 @@ def _candidates(solution, samples):
     return np.flatnonzero(smaller <= FASTEST * travelled)
 
 
-def _polished(solution, pair, time, q) -> _Found:
+def _polished(solution, pair, time, q) -> _Passage:
     """Find a passage between two states on the motion, from the time and coordinates that a polynomial says."""
     begin, accuracy = pair.ts[0], pair.ts[1] - pair.ts[0]
     if not has_parts(solution):
-        return _Found(float(time), q, float(accuracy))
+        return _Passage(float(time), q, float(accuracy))
     state = State(jnp.asarray(pair.q[0]), jnp.asarray(pair.v[0]))
     for _ in range(POLISHES):
         aside = ASIDE * (time - begin)
@@ -205,7 +205,7 @@ def _polished(solution, pair, time, q) -> _Found:
         share = -f / (g - f) if g != f else 0.5
         before, time, q = time, ts[1] + share * (ts[2] - ts[1]), qs[1] + share * (qs[2] - qs[1])
         accuracy = abs(time - before)
-    return _Found(float(time), q, float(accuracy))
+    return _Passage(float(time), q, float(accuracy))
 
 
 class _Change(NamedTuple):

@@ -31,7 +31,7 @@ from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete
 
 # A point of a body: a frame, a position on it, or None for its centre of mass, see `Solution.position`.
-Place = str | Number | Vector | None
+BodyPoint = str | Number | Vector | None
 
 
 class Solution(eqx.Module):
@@ -88,22 +88,22 @@ class Solution(eqx.Module):
     @staticmethod
     def of_run(run: Run, outcome: Outcome) -> "Solution":
         """What a run has left."""
-        initial, found, end, saved = outcome
+        initial, integrated, end, saved = outcome
         return Solution(
             run=run.remembered(),
-            ts=found.ts,
+            ts=integrated.ts,
             q=None if saved is None else saved.q,
             v=None if saved is None else saved.v,
-            ys=found.ys if saved is None else None,
-            t_end=found.t_end,
+            ys=integrated.ys if saved is None else None,
+            t_end=integrated.t_end,
             end=end,
-            stats=found.stats,
-            result=found.result,
+            stats=integrated.stats,
+            result=integrated.result,
             rank_nearby=initial.rank,
-            closest=found.closest,
-            average=found.average,
+            closest=integrated.closest,
+            average=integrated.average,
             definiteness=initial.definiteness,
-            interpolation=found.interpolation,
+            interpolation=integrated.interpolation,
         )
 
     def another(self, run: Run) -> "Solution":
@@ -143,7 +143,7 @@ class Solution(eqx.Module):
             interpolation=None,
         )
 
-    def position(self, body: str, at: Place = None) -> Float[Array, "*batch n_t 3"]:
+    def position(self, body: str, at: BodyPoint = None) -> Float[Array, "*batch n_t 3"]:
         """Position of a body's centre of mass, or of the point `at` on it [m].
 
         `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m]. On a beam,
@@ -151,11 +151,11 @@ class Solution(eqx.Module):
         """
         return self._of_point(Observables.position, body, at)
 
-    def velocity(self, body: str, at: Place = None) -> Float[Array, "*batch n_t 3"]:
+    def velocity(self, body: str, at: BodyPoint = None) -> Float[Array, "*batch n_t 3"]:
         """Velocity of a body's centre of mass, or of the point `at` on it [m/s]."""
         return self._of_point(Observables.velocity, body, at)
 
-    def acceleration(self, body: str, at: Place = None) -> Float[Array, "*batch n_t 3"]:
+    def acceleration(self, body: str, at: BodyPoint = None) -> Float[Array, "*batch n_t 3"]:
         """Acceleration of a body's centre of mass, or of the point `at` on it [m/s²]."""
         return self._of_point(Observables.acceleration, body, at)
 

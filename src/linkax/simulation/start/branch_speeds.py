@@ -95,9 +95,9 @@ def _on_branch(asked, v):
 
 
 @_on_branch.def_jvp
-def _on_branch_jvp(primals, changes):
+def _on_branch_jvp(primals, tangents):
     """Tangent by the implicit function theorem, to any order: the Newton steps have no derivative."""
-    (asked, begin), (change, begins) = primals, changes
+    (asked, begin), (change, begins) = primals, tangents
     v = _on_branch(asked, begin)
     opens = pushforward(lambda asked: asked.rest(v), (asked,), (change,))[1]
     return v, nearest_solution(asked.system, materialise(v, begins), asked.slopes(v), opens)

@@ -181,9 +181,9 @@ def close_loops(demand: LoopClosure, q: Float[Array, " n_q"]) -> Float[Array, " 
 
 
 @close_loops.def_jvp
-def _closed_jvp(primals, changes):
+def _closed_jvp(primals, tangents):
     """Tangent by the implicit function theorem, nearest to that of where the search begins; the search has none."""
-    (demand, begin), (change, begins) = primals, changes
+    (demand, begin), (change, begins) = primals, tangents
     q, topology = close_loops(demand, begin), demand.system.topology
     along = jnp.zeros_like(demand.system.scales) if begins is None else speeds(topology, begin, begins)
     at_rest = lambda demand: demand.rows(configure(demand.system, demand.t, q))
