@@ -1,7 +1,7 @@
 """What linkax asks of XLA, and of the insides of JAX and Equinox.
 
-All of it is in this package, but for two names: `linalg.pivoted_qr` has a `custom_vmap` of its own, and
-`simulation.integrate.discrete_adjoint` makes a `ShapedArray`.
+All of it is in this package and in `linkax.straight_line`, but for two names: `linalg.pivoted_qr` has a `custom_vmap`
+of its own, and `simulation.integrate.discrete_adjoint` makes a `ShapedArray`.
 
 What we rely on (where; since which version), and what happens without it:
 
@@ -24,6 +24,11 @@ used. What would have to be found another way:
   library at half of the speed.
 - `jax.extend.core.Primitive`, `jax.interpreters` `ad`, `batching`, `mlir` (`cross_product`): derivatives of vector
   products, in a fraction of the operations.
+- `jax.extend.core` Jaxpr and Literal, names and parameters of JAX's primitives (`straight_line.program`,
+  `straight_line.rules`); `jax.extend.mlir` (`straight_line.kernel`); `jax.interpreters` (`straight_line.transform`):
+  straight lines. A primitive that is not known there stays on arrays.
+- that XLA computes a reduction over two entries by its computation, in their order (`straight_line.kernel`), which is
+  tried: without it runs take several times as long; a warning says so.
 - `jax.custom_derivatives.SymbolicZero` (`derivatives`): which arguments have no tangent.
 - `jax.custom_batching.custom_vmap`, `jax.lax.platform_dependent` (`one_kernel`, `batches`): batches faster than their
   members one by one, and without LAPACK that waits for ever (`one_by_one`).
