@@ -45,7 +45,7 @@ def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
     for correct in (True, False):
         began = time.perf_counter()
         program = jax.jit(repeated, static_argnums=4).lower(system, state.q, state.v, 1, correct).compile()
-        found[correct] = _seconds(lambda count, program=program: program(system, state.q, state.v, count))
+        found[correct] = seconds_of(lambda count, program=program: program(system, state.q, state.v, count))
         if correct:
             compiling, memory = time.perf_counter() - began, program.memory_analysis()
     return {
@@ -58,7 +58,7 @@ def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
     }
 
 
-def _seconds(run):
+def seconds_of(run):
     """Of one evaluation, the shortest of several loops over as many as take long enough."""
     count = 1
     while True:

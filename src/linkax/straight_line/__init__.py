@@ -9,6 +9,7 @@ known once, and all of them in one kernel; a batch is the same line over lanes.
 - `program`: a traced function as kernels, and what stays on arrays between them.
 - `kernel`: scalar operations as one kernel of XLA.
 - `transform`: `straight_line`, with its derivatives and batches.
+- `known`: which entries of arrays a program may know.
 
 It knows nothing of mechanisms.
 """
