@@ -5,7 +5,7 @@ kernel for each operation on arrays, and computes with all entries. A straight l
 known once, and all of them in one kernel; a batch is the same line over lanes.
 
 - `graph`: scalar operations, of which what is known folds, and what is computed already is not computed again.
-- `entries`, `rules`: arrays by their entries, and what operations of JAX do with these.
+- `entries`: arrays by their entries. `rules`, `indexing`: what operations of JAX do with these.
 - `program`: a traced function as kernels, and what stays on arrays between them.
 - `kernel`: scalar operations as one kernel of XLA.
 - `transform`: `straight_line`, with its derivatives and batches.

@@ -4,7 +4,7 @@ What is known when a program is compiled folds, and what is computed already is 
 rounding: it leaves out 0 + x, 1·x and the like, and moves signs. 0·x and 0/x are 0, also where x is not finite.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -242,23 +242,16 @@ class Graph:
         with np.errstate(all="ignore"):
             return self.known(function(*values), dtype)
 
-    def sum(self, terms: list[int]) -> int | None:
-        """The sum of scalars, pair by pair, which a processor adds side by side; None for none."""
-        return self._pairs(self.add, terms)
-
-    def _pairs(self, function, terms) -> int | None:
+    def reduce(self, function: Callable[[int, int], int], terms: list[int]) -> int | None:
+        """Combine scalars pair by pair, which a processor does side by side; None for none."""
         while len(terms) > 1:
             pairs = [function(terms[k], terms[k + 1]) for k in range(0, len(terms) - 1, 2)]
             terms = pairs + ([terms[-1]] if len(terms) % 2 else [])
         return terms[0] if terms else None
 
-    def reduce(self, function: Callable[[int, int], int], terms: list[int]) -> int | None:
-        """The same with another associative function."""
-        return self._pairs(function, terms)
-
-    def needed(self, results: list[int], given: dict[int, Any]) -> list[int]:
+    def needed(self, results: list[int], given: Container[int]) -> list[int]:
         """All scalars that results are computed from, in order, down to those that are given."""
-        marked, stack = set(), [index for index in results]
+        marked, stack = set(), list(results)
         while stack:
             index = stack.pop()
             if index in marked:

@@ -6,7 +6,7 @@ from the next entries alone, so the last ones decide. The axis has two entries, 
 one entry XLA takes for a reshape, whatever it computes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Any
 
 import jax
@@ -27,10 +27,10 @@ TWICE = 2
 class Kernel:
     """Results of a graph as a function of some of its scalars; both as indices of scalars."""
 
-    def __init__(self, graph: Graph, given: Sequence[int], results: Sequence[int]) -> None:
+    def __init__(self, graph: Graph, given: Container[int], results: Sequence[int]) -> None:
         self.graph, self.results = graph, list(results)
-        self.order = graph.needed(self.results, dict.fromkeys(given))
-        self.given = [index for index in self.order if index in set(given)]
+        self.order = graph.needed(self.results, given)
+        self.given = [index for index in self.order if index in given]
         # Arguments of one type come in one array: XLA can tell that it does not overlap with a result.
         self.types = list(dict.fromkeys(graph.dtypes[index] for index in self.given))
         self.columns = [[index for index in self.given if graph.dtypes[index] == dtype] for dtype in self.types]

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from linkax.straight_line.entries import Entries, NotStraight, is_known, known_entries, values_of, where
 from linkax.straight_line.graph import Graph
-from linkax.straight_line.rules import RULES, Entries, NotStraight, is_known, known_entries, values_of
+from linkax.straight_line.rules import RULES
 
 MOST_PASSES = 64  # of a loop that is unrolled
 
@@ -33,13 +34,11 @@ class Program(NamedTuple):
     between: list[OnArrays]
 
 
-def straighten(
-    traced: ClosedJaxpr, known: Sequence[np.ndarray | None], most: int | None, unroll: bool = True
-) -> Program:
+def straighten(traced: ClosedJaxpr, known: Sequence[np.ndarray | None], most: int | None) -> Program:
     """Go through a traced function, entry by entry.
 
     **Arguments:** `known`: for each argument its entries that are known, NaN elsewhere; or None. `most`: how many
-    scalar operations there may be. `unroll`: loops of a known length; else they stay on arrays.
+    scalar operations there may be.
 
     **Raises:** `TooLong` for more operations.
     """
@@ -47,7 +46,7 @@ def straighten(
     inputs = [
         _input(graph, variable.aval, pattern) for variable, pattern in zip(traced.jaxpr.invars, known, strict=True)
     ]
-    walk = _Walk(graph, unroll)
+    walk = _Walk(graph)
     outputs = walk.closed(traced, inputs)
     return Program(graph, inputs, outputs, walk.between)
 
@@ -62,8 +61,8 @@ def _input(graph, aval, pattern=None) -> Entries:
 class _Walk:
     """The way through a traced function; `between`: see `Program`."""
 
-    def __init__(self, graph: Graph, unroll: bool) -> None:
-        self.graph, self.unroll = graph, unroll
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
         self.between: list[OnArrays] = []
 
     def closed(self, traced: ClosedJaxpr, arguments: Sequence[Entries]) -> list[Entries]:
@@ -148,19 +147,15 @@ class _Walk:
         for number, branch in enumerate(branches[1:], start=1):
             is_it = graph.compare("eq", index.item(), graph.known(number, graph.dtypes[index.item()]))
             taken = self.closed(branch, arguments)
-            select = lambda old, new, is_it=is_it: _where(graph, is_it, new, old)
+            select = lambda old, new, is_it=is_it: where(graph, is_it, new, old)
             found = [select(old, new) for old, new in zip(found, taken, strict=True)]
         return found
 
     def _scan(self, params, arrays):
-        if not self.unroll or params["length"] > MOST_PASSES:
+        if params["length"] > MOST_PASSES:
             raise NotStraight
-        constants, carried = _lengths_of_scan(params)
-        constants, carry, rows = (
-            arrays[:constants],
-            arrays[constants : constants + carried],
-            arrays[constants + carried :],
-        )
+        first, carried = _lengths_of_scan(params)
+        constants, carry, rows = arrays[:first], arrays[first : first + carried], arrays[first + carried :]
         made, order = [], range(params["length"])
         for k in reversed(order) if params["reverse"] else order:
             found = self.closed(params["jaxpr"], [*constants, *carry, *(np.asarray(row[k]) for row in rows)])
@@ -179,17 +174,12 @@ class _Walk:
         body, carry = arrays[for_condition : for_condition + for_body], arrays[for_condition + for_body :]
         for _ in range(MOST_PASSES):
             (goes_on,) = self.closed(params["cond_jaxpr"], [*condition, *carry])
-            if not is_known(self.graph, goes_on) or not self.unroll:
+            if not is_known(self.graph, goes_on):
                 raise NotStraight
             if not values_of(self.graph, goes_on).item():
                 return carry
             carry = self.closed(params["body_jaxpr"], [*body, *carry])
         raise NotStraight
-
-
-def _where(graph: Graph, condition: int, true: Entries, false: Entries) -> Entries:
-    chosen = [graph.select(condition, f, t) for t, f in zip(true.ravel().tolist(), false.ravel().tolist(), strict=True)]
-    return np.array(chosen, dtype=int).reshape(true.shape)
 
 
 def _lengths_of_scan(params) -> tuple[int, int]:

@@ -11,47 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from linkax.straight_line.graph import Graph
-
-Entries = np.ndarray  # of indices of scalars
-MOST_CHOICES = 64  # from which an index that is not known selects
-
-
-class NotStraight(Exception):
-    """An operation that has no straight line."""
-
-
-def each(function: Callable[..., int], *arrays: Entries) -> Entries:
-    """Apply a function of scalars to each entry of arrays of one shape, or of scalars beside them."""
-    made: dict[tuple[int, ...], int] = {}
-    arrays = tuple(np.broadcast_arrays(*arrays))
-    found = np.empty(arrays[0].size, dtype=int)
-    for place, operands in enumerate(zip(*(array.ravel().tolist() for array in arrays), strict=True)):
-        entry = made.get(operands)
-        if entry is None:
-            entry = made[operands] = function(*operands)
-        found[place] = entry
-    return found.reshape(arrays[0].shape)
-
-
-def known_entries(graph: Graph, array: Any) -> Entries:
-    """The entries of an array that is known."""
-    array = np.asarray(array)
-    entries = [graph.known(value, array.dtype) for value in array.ravel()]
-    return np.array(entries, dtype=int).reshape(array.shape)
-
-
-def values_of(graph: Graph, entries: Entries) -> np.ndarray:
-    """The values of entries that have to be known."""
-    values = [graph.values[index] for index in entries.ravel().tolist()]
-    if any(value is None for value in values):
-        raise NotStraight
-    return np.array(values).reshape(entries.shape)
-
-
-def is_known(graph: Graph, entries: Entries) -> bool:
-    """Whether all entries are known."""
-    return all(graph.values[index] is not None for index in entries.ravel().tolist())
+from linkax.straight_line.entries import Entries, NotStraight, each, known_entries
+from linkax.straight_line.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
 
 
 def _each_of(name):
@@ -89,7 +50,7 @@ def _reduced(combine):
 
 
 def _sum_of(graph, dtype, terms):
-    found = graph.sum([term for term in terms if not graph.is_zero(term)])
+    found = graph.reduce(graph.add, [term for term in terms if not graph.is_zero(term)])
     return graph.known(0, dtype) if found is None else found
 
 
@@ -169,8 +130,8 @@ def _dot_general(graph, params, arrays, results):
 
 def _cross(graph, params, arrays, results):
     a, b = arrays
-    product = lambda i, j: each(lambda p, q: graph.mul(p, q), a[..., i], b[..., j])
-    component = lambda i, j: each(lambda p, q: graph.sub(p, q), product(i, j), product(j, i))
+    product = lambda i, j: each(graph.mul, a[..., i], b[..., j])
+    component = lambda i, j: each(graph.sub, product(i, j), product(j, i))
     return [np.stack([component(1, 2), component(2, 0), component(0, 1)], axis=-1)]
 
 
@@ -217,9 +178,7 @@ def _select_n(graph, params, arrays, results):
 
 
 def _clamp(graph, params, arrays, results):
-    low, array, high = arrays
-    low, high = np.broadcast_to(low, array.shape), np.broadcast_to(high, array.shape)
-    return [each(lambda a, x, b: graph.min(graph.max(x, a), b), low, array, high)]
+    return [each(lambda low, x, high: graph.min(graph.max(x, low), high), *arrays)]
 
 
 def _integer_pow(graph, params, arrays, results):
@@ -228,192 +187,6 @@ def _integer_pow(graph, params, arrays, results):
 
 def _convert(graph, params, arrays, results):
     return [each(lambda a: graph.convert(a, params["new_dtype"]), arrays[0])]
-
-
-def _places(shape, indices, window, start_map, collapsed, batching, index_batching, offset_axes, clip):
-    """Flat places in an array of a shape that windows at indices read or write, −1 for those outside.
-
-    As in XLA's gather: `window`: size along each axis; `start_map`: the axis of each component of an index;
-    `collapsed`, `batching`: axes that the result lacks; `offset_axes`: axes of the result along windows.
-    """
-    batch = indices.shape[:-1]
-    offsets = [axis for axis in range(len(shape)) if axis not in collapsed and axis not in batching]
-    inside = [window[axis] for axis in offsets]
-    place, valid = np.zeros((*batch, *inside), dtype=int), np.ones((*batch, *inside), dtype=bool)
-    along = lambda array: array.reshape(array.shape + (1,) * len(inside))
-    for axis, size in enumerate(shape):
-        at = np.zeros((*batch, *inside), dtype=int)
-        if axis in start_map:
-            start = indices[..., list(start_map).index(axis)]
-            start = np.clip(start, 0, size - window[axis]) if clip else start
-            at = at + along(start)
-        if axis in batching:
-            of = index_batching[list(batching).index(axis)]
-            spread = [1] * (len(batch) + len(inside))
-            spread[of] = batch[of]
-            at = at + np.arange(size).reshape(spread)
-        if axis in offsets:
-            spread = [1] * (len(batch) + len(inside))
-            spread[len(batch) + offsets.index(axis)] = window[axis]
-            at = at + np.arange(window[axis]).reshape(spread)
-        valid = valid & (at >= 0) & (at < size)
-        place = place * size + at
-    if not clip:
-        # XLA leaves out a window of which a part is outside.
-        inner = tuple(range(len(batch), place.ndim))
-        valid = np.broadcast_to(np.all(valid, axis=inner, keepdims=True), valid.shape)
-    place = np.where(valid, place, -1)
-    return np.moveaxis(place, range(len(batch), place.ndim), offset_axes) if inside else place
-
-
-def _gather(graph, params, arrays, results):
-    array, indices = arrays
-    numbers, dtype = params["dimension_numbers"], results[0].dtype
-    clip, window, start_map = "FILL" not in str(params["mode"]), params["slice_sizes"], numbers.start_index_map
-    fill = params["fill_value"]
-    if fill is None:
-        fill = np.nan if dtype.kind == "f" else True if dtype.kind == "b" else np.iinfo(dtype).min
-    flat = np.append(array.ravel(), 0 if clip else graph.known(fill, dtype))
-    found = np.full(results[0].shape, flat[-1], dtype=int)
-    # What is read at the first of all places is left where no other one is chosen, but for what fills.
-    is_first = clip
-    for known, condition in _choices(graph, indices, array.shape, window, start_map, clip):
-        places = _places(
-            array.shape,
-            known,
-            window,
-            start_map,
-            numbers.collapsed_slice_dims,
-            numbers.operand_batching_dims,
-            numbers.start_indices_batching_dims,
-            numbers.offset_dims,
-            clip,
-        )
-        entries = flat[places]
-        if condition is None or is_first:
-            found, is_first = entries, False
-            continue
-        conditions = _along_windows(condition, entries.shape, numbers.offset_dims)
-        chosen = [
-            graph.select(is_it, old, new)
-            for is_it, old, new in zip(conditions, found.ravel().tolist(), entries.ravel().tolist(), strict=True)
-        ]
-        found = np.array(chosen, dtype=int).reshape(entries.shape)
-    return [found]
-
-
-def _choices(graph, indices, shape, window, start_map, clip):
-    """Known indices; where one component is not known, all that it can be, with what selects each.
-
-    **Yields:** indices, and for each window the index of a scalar that is true for them; None for all.
-    """
-    rows = indices.reshape(math.prod(indices.shape[:-1]), indices.shape[-1])
-    unknown = [c for c in range(rows.shape[1]) if not is_known(graph, rows[:, c])]
-    if not unknown:
-        yield values_of(graph, indices), None
-        return
-    (component, *more), axis = unknown, start_map[unknown[0]]
-    last = shape[axis] - window[axis]
-    if more or last >= MOST_CHOICES:
-        raise NotStraight
-    for choice in range(last + 1):
-        known = np.zeros(indices.shape, dtype=int)
-        for c in range(rows.shape[1]):
-            known[..., c] = choice if c == component else values_of(graph, indices[..., c])
-        yield known, each(lambda index, at=choice: _is_at(graph, index, at, last, clip), indices[..., component])
-
-
-def _is_at(graph, index, place, last, clip=True):
-    """Whether an index that is not known is at a place from 0 to `last`, or clipped to it."""
-    dtype = graph.dtypes[index]
-    if clip and last == 0:
-        return graph.known(True, np.dtype(bool))
-    name = "le" if clip and place == 0 else "ge" if clip and place == last else "eq"
-    return graph.compare(name, index, graph.known(place, dtype))
-
-
-def _scatter(combine):
-    def rule(graph, params, arrays, results):
-        array, indices, updates = arrays
-        numbers = params["dimension_numbers"]
-        without = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
-        sizes = iter(updates.shape[axis] for axis in numbers.update_window_dims)
-        window = [1 if axis in without else next(sizes) for axis in range(array.ndim)]
-        found, entries = array.ravel().tolist(), updates.ravel().tolist()
-        clip, start_map = "CLIP" in str(params["mode"]), numbers.scatter_dims_to_operand_dims
-        for known, condition in _choices(graph, indices, array.shape, window, start_map, clip):
-            places = _places(
-                array.shape,
-                known,
-                window,
-                start_map,
-                numbers.inserted_window_dims,
-                numbers.operand_batching_dims,
-                numbers.scatter_indices_batching_dims,
-                numbers.update_window_dims,
-                clip,
-            )
-            conditions = _along_windows(condition, updates.shape, numbers.update_window_dims)
-            for place, entry, is_it in zip(places.ravel().tolist(), entries, conditions, strict=True):
-                if place >= 0:
-                    written = combine(graph, found[place], entry)
-                    found[place] = written if is_it is None else graph.select(is_it, found[place], written)
-        return [np.array(found, dtype=int).reshape(array.shape)]
-
-    return rule
-
-
-def _along_windows(condition, shape, window_axes):
-    """What selects each window, for each entry; None for all of them."""
-    if condition is None:
-        return itertools.repeat(None, math.prod(shape))
-    spread = [1 if axis in window_axes else size for axis, size in enumerate(shape)]
-    return np.broadcast_to(condition.reshape(spread), shape).ravel().tolist()
-
-
-def _starts(graph, starts, shape, window):
-    """Known starts of a slice; where some are not known, all that they can be, with what selects them."""
-    each_axis = []
-    for start, size, length in zip(starts, shape, window, strict=True):
-        index, last = start.item(), size - length
-        value = graph.values[index]
-        if value is not None:
-            each_axis.append([(min(max(int(value), 0), last), None)])
-            continue
-        if last >= MOST_CHOICES:
-            raise NotStraight
-        choices = [(at, None if last == 0 else _is_at(graph, index, at, last)) for at in range(last + 1)]
-        each_axis.append(choices)
-    chosen = []
-    for combination in itertools.product(*each_axis):
-        conditions = [condition for _, condition in combination if condition is not None]
-        chosen.append(([at for at, _ in combination], graph.reduce(graph.logical_and, conditions)))
-    return chosen
-
-
-def _dynamic_slice(graph, params, arrays, results):
-    array, *starts = arrays
-    window = params["slice_sizes"]
-    found = None
-    for at, condition in _starts(graph, starts, array.shape, window):
-        part = array[tuple(slice(first, first + length) for first, length in zip(at, window, strict=True))]
-        found = part if found is None or condition is None else _where(graph, condition, part, found)
-    return [found]
-
-
-def _dynamic_update_slice(graph, params, arrays, results):
-    array, update, *starts = arrays
-    found = array
-    for at, condition in _starts(graph, starts, array.shape, update.shape):
-        window = tuple(slice(first, first + length) for first, length in zip(at, update.shape, strict=True))
-        written = found.copy()
-        written[window] = update if condition is None else _where(graph, condition, update, found[window])
-        found = written
-    return [found]
-
-
-def _where(graph, condition, true, false):
-    return each(lambda t, f: graph.select(condition, f, t), true, false)
 
 
 def _split(graph, params, arrays, results):
@@ -507,12 +280,12 @@ RULES: dict[str, Callable[..., list[Any]]] = {
     "iota": _iota,
     "slice": _slice,
     "pad": _pad,
-    "gather": _gather,
-    "scatter": _scatter(lambda graph, old, new: new),
-    "scatter-add": _scatter(lambda graph, old, new: graph.add(old, new)),
-    "scatter-mul": _scatter(lambda graph, old, new: graph.mul(old, new)),
-    "dynamic_slice": _dynamic_slice,
-    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": gather,
+    "scatter": scatter(lambda graph, old, new: new),
+    "scatter-add": scatter(lambda graph, old, new: graph.add(old, new)),
+    "scatter-mul": scatter(lambda graph, old, new: graph.mul(old, new)),
+    "dynamic_slice": dynamic_slice,
+    "dynamic_update_slice": dynamic_update_slice,
     "split": _split,
     "tile": _tile,
     "unstack": _unstack,

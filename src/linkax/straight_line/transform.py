@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import ShapedArray, Tracer
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxlib import version as jaxlib
@@ -19,7 +19,7 @@ from linkax.straight_line.graph import TooLong
 from linkax.straight_line.kernel import Kernel
 from linkax.straight_line.program import Program, straighten
 from linkax.xla.flags import WHOLE_LOOP_BYTES, makes_kernels_of_loops
-from linkax.xla.tracing import evaluate_now
+from linkax.xla.tracing import all_concrete, evaluate_now
 
 Output = TypeVar("Output")
 
@@ -82,7 +82,7 @@ def computes_kernels() -> bool:
 def _without_tracers(made: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
     """A traced function whose constants are known, and its others, which become its first arguments."""
     jaxpr = made.jaxpr
-    outside = [isinstance(constant, Tracer) for constant in made.consts]
+    outside = [not all_concrete(constant) for constant in made.consts]
     pairs = list(zip(jaxpr.constvars, made.consts, outside, strict=True))
     if not any(outside):
         return made, []
@@ -105,6 +105,7 @@ class Traced:
         self.inputs = [ShapedArray(variable.aval.shape, variable.aval.dtype) for variable in jaxpr.jaxpr.invars]
         self.outputs = [ShapedArray(aval.shape, aval.dtype) for aval in jaxpr.out_avals]
         self.tangent, self.transposed = cache(self._tangent), cache(self._transposed)
+        self.compiled = cache(self._compiled)
 
     @cached_property
     def program(self) -> Program | None:
@@ -154,6 +155,10 @@ class Traced:
         fixed = [aval for aval, of in zip(self.inputs, linear, strict=True) if not of]
         return Traced(jax.make_jaxpr(cotangents)(*fixed, *self.outputs), self.most)
 
+    def _compiled(self, lanes, batched):
+        """A program of its own, for calls outside of others; kept with this object, and no longer."""
+        return jax.jit(partial(_straight.bind, traced=self, lanes=lanes, batched=batched))
+
 
 def _no_tangent(primal):
     if jnp.issubdtype(primal.dtype, jnp.inexact):
@@ -197,7 +202,7 @@ def _in_kernels(*operands, traced: Traced, lanes: int | None, batched: tuple[boo
         wanted = dict.fromkeys(index for entries in parts for index in entries.ravel().tolist())
         wanted = [index for index in wanted if index not in scalars and graph.values[index] is None]
         if wanted:
-            kernel = Kernel(graph, list(scalars), wanted)
+            kernel = Kernel(graph, scalars, wanted)
             scalars.update(zip(wanted, kernel(scalars, shape), strict=True))
 
     def dense(entries, aval):
@@ -249,11 +254,6 @@ def _in_parts(*operands, traced, lanes, batched, together):
 
 def _abstract(*operands, traced: Traced, lanes, batched):
     return [aval if lanes is None else ShapedArray((lanes, *aval.shape), aval.dtype) for aval in traced.outputs]
-
-
-@cache
-def _compiled(traced, lanes, batched):
-    return jax.jit(lambda *operands: _straight.bind(*operands, traced=traced, lanes=lanes, batched=batched))
 
 
 def _jvp(primals, tangents, *, traced: Traced, lanes, batched):
@@ -314,7 +314,7 @@ _straight = Primitive("straight_line")
 _straight.multiple_results = True
 _straight.def_abstract_eval(_abstract)
 _straight.def_impl(
-    lambda *operands, traced, lanes, batched: _compiled(traced, lanes, batched)(*operands),
+    lambda *operands, traced, lanes, batched: traced.compiled(lanes, batched)(*operands),
 )
 ad.primitive_jvps[_straight] = _jvp
 ad.primitive_transposes[_straight] = _transpose
