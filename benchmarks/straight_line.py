@@ -2,8 +2,8 @@
 
 Each row: scalar operations of the straight line, and seconds to go through the traced evaluation; then for one state,
 and for a member of a batch of LANES, microseconds of both, their ratio, and seconds to compile each. Zeros, ones and
-minus ones in the mechanism's vectors and matrices are known to both, its other numbers are inputs. Times are of this
-machine, this run: compare ratios.
+minus ones in the mechanism's vectors and matrices are known to the straight line, other numbers are inputs. Times are
+of this machine, this run: compare ratios.
 """
 
 import time
@@ -18,7 +18,7 @@ from benchmarks.evaluation import SMALLEST, seconds_of
 from benchmarks.parts import print_parts
 from benchmarks.problems import PROBLEMS
 from linkax.equations.system import system_of
-from linkax.straight_line.known import KnownEntries
+from linkax.straight_line.known import patterns_of
 from linkax.straight_line.transform import MOST_OPERATIONS, Traced, straight_line
 
 EVALUATED = ("M1n", "M1a", "M2-1", "M3", "planar-four-bar", "FL3", "rigid-crane")
@@ -27,45 +27,47 @@ LANES = 256
 
 def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
     """Of an evaluation at a state."""
-    numbers, static = eqx.partition((lx.TangentSpace().prepared(float), system_of(mechanism, float)), eqx.is_array)
-    known = KnownEntries.of(numbers)
+    system = system_of(mechanism, float)
 
-    def evaluate(numbers, q, v):
-        method, system = eqx.combine(known.impose(numbers), static)
-        return method.derivative(system, jnp.zeros(()), q, v, True)[:3]
+    def evaluate(system, q, v):
+        return lx.TangentSpace().prepared(float).derivative(system, jnp.zeros(()), q, v, True)[:3]
 
-    traced = Traced(jax.make_jaxpr(evaluate)(numbers, state.q, state.v), MOST_OPERATIONS)
+    given = system, state.q, state.v
+    arrays, static = eqx.partition(given, eqx.is_array)
+    function = lambda arrays: evaluate(*eqx.combine(arrays, static))
+    traced = Traced(jax.make_jaxpr(function)(arrays), patterns_of(given), MOST_OPERATIONS)
     began = time.perf_counter()
     program = traced.program
     walked = time.perf_counter() - began
     found = {"operations": None if program is None else program.graph.count, "walk_s": walked}
     for name, function in (("", lambda function: function), ("straight_", straight_line)):
         for lanes in (1, LANES):
-            us, compiling = _measured(function(evaluate), numbers, state, lanes)
+            us, compiling = _measured(function(evaluate), system, state, lanes)
             found |= {f"{name}us_of_{lanes}": us, f"{name}compile_s_of_{lanes}": compiling}
     for lanes in (1, LANES):
         found[f"ratio_of_{lanes}"] = found[f"us_of_{lanes}"] / found[f"straight_us_of_{lanes}"]
     return found
 
 
-def _measured(evaluate, arrays, state, lanes):
+def _measured(evaluate, system, state, lanes):
     """Microseconds for each member, and seconds to compile."""
     if lanes > 1:
-        evaluate = jax.vmap(evaluate, in_axes=(None, 0, 0))
+        evaluate = eqx.filter_vmap(evaluate, in_axes=(None, 0, 0))
     given = [array if lanes == 1 else jnp.tile(array, (lanes, 1)) for array in (state.q, state.v)]
 
-    def repeated(arrays, q, v, count):
+    @eqx.filter_jit
+    def repeated(system, q, v, count):
         def once(_, carry):
             q, v = carry
-            found_v, acceleration, found_q = evaluate(arrays, q, v)
+            found_v, acceleration, found_q = evaluate(system, q, v)
             return q + SMALLEST * found_q, v + SMALLEST * (found_v + acceleration)
 
         return jax.lax.fori_loop(0, count, once, (q, v))
 
     began = time.perf_counter()
-    program = jax.jit(repeated).lower(arrays, *given, 1).compile()
+    program = repeated.lower(system, *given, jnp.asarray(1)).compile()
     compiling = time.perf_counter() - began
-    return 1e6 * seconds_of(lambda count: program(arrays, *given, count)) / lanes, compiling
+    return 1e6 * seconds_of(lambda count: program(system, *given, jnp.asarray(count))) / lanes, compiling
 
 
 def evaluations() -> Iterator[dict]:

@@ -13,9 +13,7 @@ if not AS_USERS_DO:
     os.environ.setdefault(
         "XLA_FLAGS",
         "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true "
-        "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
-        # Loops left as they are, see linkax.xla.flags.
-        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024",
+        "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1",
     )
 # What one test file has compiled, in this process or another, the next one reads. Errors of Equinox as numbers that are
 # not finite: a program with a callback in it cannot be kept.

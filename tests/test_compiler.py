@@ -1,7 +1,8 @@
-"""Runs in kernels of whole loops, as users get them, against runs without (see conftest)."""
+"""Runs as users get them, in kernels, against runs that are compiled quickly (see conftest), and without kernels."""
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from compiled_as_users_do import motion
 
 from linkax.xla import flags as xla_flags
 from linkax.xla import memory_maps
-from linkax.xla.flags import LOOPS, makes_kernels_of_loops, quickest_to_compile, set_flags
+from linkax.xla.flags import LOOPS, quickest_to_compile, set_flags
 from linkax.xla.memory_maps import ROOM
 from linkax.xla.tracing import quick_compile
 
@@ -36,7 +37,6 @@ def as_users_do():
 def test_importing_linkax_is_enough_for_kernels(as_users_do):
     assert as_users_do["makes_kernels"]
     assert as_users_do["kernels"]["loops"] > 0
-    assert not makes_kernels_of_loops()
 
 
 @pytest.mark.parametrize("compiled", ["motion", "motion_once"])
@@ -71,13 +71,17 @@ def test_the_loop_over_steps_is_one_kernel(as_users_do):
     assert as_users_do["assembled_inside"]["of_run"] == [False]
 
 
-def test_slow_loops_are_told_once_unless_asked_for(monkeypatch):
-    """Flags that come too late, as XLA has read those of the tests."""
-    makes_kernels_of_loops.__wrapped__()
-    for given in ("", LOOPS, "--xla_backend_extra_options=something"):
-        monkeypatch.setenv("XLA_FLAGS", given)
-        with pytest.warns(RuntimeWarning, match=r"jaxlib .* no kernels of loops; import linkax before"):
-            makes_kernels_of_loops.__wrapped__()
+def test_slow_loops_are_told_unless_asked_for():
+    """Where linkax is imported too late for its flags, all is computed on arrays."""
+    found = _as_users_do("compiled_without_kernels.py")
+    asked_for = found["warnings"].pop("slow loops")
+    assert not asked_for["made"]
+    assert not asked_for["told"]
+    for name, of in found["warnings"].items():
+        assert not of["made"], name
+        assert re.search(r"jaxlib .* no kernels of loops; import linkax before", of["told"][0]), name
+    assert not found["straight"]
+    np.testing.assert_allclose(found["motion"]["speeds"], motion()["speeds"], rtol=1e-10)
 
 
 def test_options_that_a_version_does_not_know_are_left_out(monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 from programs import Program, arguments
 
-from linkax.straight_line import kernel
+from linkax.straight_line import kernel, rules
 from linkax.straight_line.graph import Graph
 from linkax.straight_line.transform import Traced, computes_kernels, straight_line
 
@@ -18,7 +18,7 @@ TOLERANCES = {np.dtype(np.float64): 1e-13, np.dtype(np.float32): 2e-5}
 
 def operations(function, *arguments):
     """How many scalar operations the results need, and how many operations stay on arrays."""
-    program = Traced(jax.make_jaxpr(function)(*arguments), 10_000).program
+    program = Traced(jax.make_jaxpr(function)(*arguments), [None] * len(arguments), 10_000).program
     assert program is not None
     results = [index for entries in program.outputs for index in entries.ravel().tolist()]
     needed = program.graph.needed(results, {})
@@ -118,7 +118,7 @@ def test_known_zeros_cost_nothing():
 
 def test_a_derivative_folds_anew():
     function = lambda x: jnp.array([2.0 * x[0], x[1] * x[1], 3.0])
-    traced = Traced(jax.make_jaxpr(function)(jnp.ones(2)), 100)
+    traced = Traced(jax.make_jaxpr(function)(jnp.ones(2)), [None], 100)
     program = traced.tangent((True,)).program
     assert program is not None
     assert program.graph.values[program.outputs[0][2]] == 0.0
@@ -149,6 +149,58 @@ def test_what_is_not_finite_spoils_its_own_member_alone():
     products, _, signs = jax.vmap(function, in_axes=(0, None))(x, jnp.array(2.0))
     np.testing.assert_array_equal(products, [2.0, np.nan, 6.0])
     np.testing.assert_array_equal(signs, [True, False, True])
+
+
+ON_TWO = ("atan2", "pow", "rem", "nextafter")
+ON_INTEGERS = ("shift_left", "shift_right_logical", "shift_right_arithmetic", "population_count", "clz")
+
+
+@pytest.mark.parametrize("name", sorted({*rules.OTHERS} - {"xor", "round"}))
+def test_each_function_of_numbers(name):
+    """Alone and in lanes; what JAX makes of several operations of XLA, too."""
+    given = [jnp.array([0.3, 0.7]), jnp.array([0.4, 0.9])][: 2 if name in ON_TWO else 1]
+    if name in ON_INTEGERS:
+        given = [jnp.array([3, 5]), jnp.array([1, 2])][: 2 if name.startswith("shift") else 1]
+    if name == "acosh":
+        given = [1.0 + array for array in given]
+    function = lambda *given: (getattr(lax, name)(*given), given[0])
+    assert_same(jax.jit(straight_line(function))(*given), function(*given))
+    several = [jnp.stack([array, array[::-1]]) for array in given]
+    assert_same(jax.jit(jax.vmap(straight_line(function)))(*several), jax.vmap(function)(*several))
+
+
+def test_results_that_only_xla_can_tell():
+    """Constants and arguments, of each type, beside computed ones: of a fusion XLA expects none."""
+
+    def function(x, n):
+        unknown = lax.optimization_barrier(lax.erf(1.0)) * 0.0
+        whole = n - n, n * 0 + 7, (n < n).astype(n.dtype)
+        return x * 2.0, x - x, x / x, jnp.where(x == x, x, 3.0), x != x, n == n, *whole, lax.erf(1.0), unknown + 1.0
+
+    given = jnp.array(0.7), jnp.array(3)
+    assert_same(jax.jit(straight_line(function))(*given), function(*given))
+    several = jnp.array([0.7, np.nan, 1.5]), jnp.array([3, 4, 5])
+    expected = [np.array(array) for array in jax.vmap(function)(*several)]
+    for found, array in zip(jax.jit(jax.vmap(straight_line(function)))(*several), expected, strict=True):
+        np.testing.assert_array_equal(np.asarray(found)[::2], array[::2])
+
+
+def test_one_argument_of_a_type():
+    """Read by a select, and by itself."""
+    function = lambda x, n, b: (jnp.where(b, x, 2.0 * x), jnp.where(b, n, 3), lax.select(b, b, x > 0.5), x + n)
+    given = jnp.array(0.7), jnp.array(3), jnp.array(True)
+    for lanes in (1, 3):
+        several = [jnp.stack([array] * lanes) for array in given]
+        assert_same(jax.jit(jax.vmap(straight_line(function)))(*several), jax.vmap(function)(*several))
+    assert_same(jax.jit(straight_line(function))(*given), function(*given))
+
+
+def test_as_many_entries_and_lanes_as_one_kernel_has():
+    """XLA must make a kernel of the loop around a fusion, however large."""
+    function = lambda x: jnp.sin(x) + jnp.roll(x, 1)
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(300, 2000)))
+    assert_same(jax.jit(straight_line(function))(x[0]), jax.jit(function)(x[0]))
+    assert_same(jax.jit(jax.vmap(straight_line(function)))(x), jax.jit(jax.vmap(function))(x))
 
 
 def test_more_lanes_than_are_computed_together():

@@ -1,5 +1,6 @@
 """The numbers of a mechanism, stacked in the order of its bodies and joints."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -16,11 +17,12 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import largest
 from linkax.spatial.vectors import length as length_of
+from linkax.straight_line.known import KnownEntries, KnowsEntries
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import positive_or_one
 
 
-class System(eqx.Module):
+class System(KnowsEntries):
     """A mechanism as arrays: bodies in tree order (n_b), joints tree first, then cut (n_j).
 
     - `mass` [kg] (n_b,), `center_of_mass` [m] (n_b, 3), `inertia` about it [kg m²] (n_b, 3, 3),
@@ -76,12 +78,24 @@ class System(eqx.Module):
         return largest(v / self.scales)
 
 
-def system_of(mechanism: Mechanism, dtype: DTypeLike, fixed_scales: bool = True) -> System:
+def system_of(
+    mechanism: Mechanism, dtype: DTypeLike, fixed_scales: bool = True, known: KnownEntries | None = None
+) -> System:
     """Stack the numbers of a mechanism in a floating-point type.
 
-    **Arguments:** `fixed_scales`: lengths that serve as scales have no derivative, since no motion depends on them;
-    what is told in them does, such as the distance from a singular configuration.
+    **Arguments:**
+
+    - `fixed_scales`: lengths that serve as scales have no derivative, since no motion depends on them; what is told in
+      them does, such as the distance from a singular configuration.
+    - `known`: which entries of the mechanism's arrays a program may know; by default those of arrays that are not
+      traced.
     """
+    known = KnownEntries.of(mechanism) if known is None else known
+    known = known.through(_stacked, mechanism, np.dtype(dtype), fixed_scales)
+    return dataclasses.replace(_stacked(mechanism, dtype, fixed_scales), known=known)
+
+
+def _stacked(mechanism, dtype, fixed_scales) -> System:
     topology, joints = mechanism.topology, mechanism.joints
 
     def stack(entries, shape):
@@ -102,6 +116,7 @@ def system_of(mechanism: Mechanism, dtype: DTypeLike, fixed_scales: bool = True)
     coupling = _coupling(mechanism, dtype)
     slides = jnp.where(topology.slides, length, jnp.ones((), dtype))
     return System(
+        known=None,
         topology=topology,
         mass=stack([body.mass for body in mechanism.bodies], ()),
         center_of_mass=center_of_mass,

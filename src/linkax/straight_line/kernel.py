@@ -1,11 +1,11 @@
-"""Scalar operations as one kernel of XLA: the computation of a reduction that reduces nothing.
+"""Scalar operations as one kernel of XLA: a fusion, as XLA makes them itself of what operations it sees together.
 
-XLA compiles the computation of a reduction as one stretch of scalar code, and over the other axis, the lanes, as a
-loop that a processor's vector instructions take several at a time. Here each result of the reduction is computed anew
-from the next entries alone, so the last ones decide. The axis has two entries, which are the same: a reduction over
-one entry XLA takes for a reshape, whatever it computes.
+XLA compiles a fusion as one stretch of scalar code, and over the lanes as a loop that a processor's vector instructions
+take several at a time. It does so in kernels of loops alone, see `linkax.xla.flags`: elsewhere it expects of a fusion
+what only its own have, and ends the process. So each is in a loop that runs once.
 """
 
+import math
 from collections.abc import Callable, Container, Sequence
 from typing import Any
 
@@ -21,143 +21,133 @@ from jax.interpreters import mlir
 
 from linkax.straight_line.graph import KNOWN, Graph
 
-TWICE = 2
-
 
 class Kernel:
-    """Results of a graph as a function of some of its scalars; both as indices of scalars."""
+    """Results of a graph as a function of some of its scalars; both as indices of scalars.
 
-    def __init__(self, graph: Graph, given: Container[int], results: Sequence[int]) -> None:
-        self.graph, self.results = graph, list(results)
+    `checked`: scalars that spoil all results where they are not finite.
+    """
+
+    def __init__(
+        self, graph: Graph, given: Container[int], results: Sequence[int], checked: Container[int] = ()
+    ) -> None:
+        self.graph, self.results, self.checked = graph, list(results), checked
         self.order = graph.needed(self.results, given)
         self.given = [index for index in self.order if index in given]
-        # Arguments of one type come in one array: XLA can tell that it does not overlap with a result.
+        # Arguments of one type come in one array, with a row of zeros: XLA can tell that it overlaps with no result.
         self.types = list(dict.fromkeys(graph.dtypes[index] for index in self.given))
         self.columns = [[index for index in self.given if graph.dtypes[index] == dtype] for dtype in self.types]
 
     def __call__(self, scalars: dict[int, jax.Array], lanes: tuple[int, ...]) -> list[jax.Array]:
-        """Compute the results, (lanes) each, from the scalars that are given; not a number where one is not finite."""
-        columns = [jnp.stack([jnp.broadcast_to(scalars[index], lanes) for index in column]) for column in self.columns]
-        real = [column for column in columns if jnp.issubdtype(column.dtype, jnp.inexact)]
-        finite = jnp.ones(lanes, bool)
-        for column in real:
-            finite = finite & jnp.all(jnp.isfinite(column), axis=0)
-        nothing = [_undefined(self.graph.dtypes[index], lanes) for index in self.results]
+        """Compute the results, (lanes) each, from the scalars that are given."""
+        count = math.prod(lanes)
+        rows = lambda column, dtype: [*(scalars[index] for index in column), jnp.zeros((), dtype)]
+        columns = [
+            jnp.stack([jnp.broadcast_to(row, lanes) for row in rows(column, dtype)]).reshape(-1, count)
+            for column, dtype in zip(self.columns, self.types, strict=True)
+        ]
+        finite = jnp.ones(count, bool)
+        for column, indices, dtype in zip(columns, self.columns, self.types, strict=True):
+            if dtype.kind == "f":
+                passes = np.array([index not in self.checked for index in indices] + [True])[:, None]
+                finite = finite & jnp.all(jnp.isfinite(column) | passes, axis=0)
+        # Behind a barrier, so that XLA knows neither that the loop runs once nor what results are beside the fusion.
+        spoils = jnp.where(finite, jnp.float32(0.0), jnp.nan)
+        begins, spoils = lax.optimization_barrier((jnp.any(finite), spoils))
+        types = [self.graph.dtypes[index] for index in self.results]
+        nothing = [jnp.full(count, jnp.nan if dtype.kind == "f" else 0, dtype) for dtype in types]
 
         def compute(carry):
-            found = _kernel.bind(*lax.optimization_barrier(columns), kernel=self, lanes=lanes)
+            found = _kernel.bind(spoils, *(column.ravel() for column in columns), kernel=self, lanes=count)
             return jnp.zeros((), bool), found
 
-        # A loop that runs once: what is in it XLA neither computes again for each reader, nor merges with these.
-        _, found = lax.while_loop(lambda carry: carry[0], compute, (jnp.any(finite), nothing))
-        if not lanes:
-            return found
-        return [jnp.where(finite, array, other) for array, other in zip(found, nothing, strict=True)]
+        _, found = lax.while_loop(lambda carry: carry[0], compute, (begins, nothing))
+        return [array.reshape(lanes) for array in found]
 
 
-def _undefined(dtype, lanes):
-    return jnp.full(lanes, np.nan if dtype.kind == "f" else 0, dtype)
+def _abstract(spoils, *columns, kernel: Kernel, lanes: int):
+    return [ShapedArray((lanes,), kernel.graph.dtypes[index]) for index in kernel.results]
 
 
-def _abstract(*columns, kernel: Kernel, lanes):
-    return [ShapedArray(lanes, kernel.graph.dtypes[index]) for index in kernel.results]
-
-
-def _tensor(dtype, shape=()):
-    return ir.RankedTensorType.get(list(shape), mlir.dtype_to_ir_type(np.dtype(dtype)))
-
-
-def _constant(value, dtype):
-    array: Any = np.asarray(value, dtype)
-    bits: Any = np.packbits(array.reshape(1), bitorder="little") if array.dtype.kind == "b" else array
-    return stablehlo.constant(ir.DenseElementsAttr.get(bits, type=mlir.dtype_to_ir_type(array.dtype), shape=[]))
-
-
-def _integers(values):
-    return ir.DenseI64ArrayAttr.get(list(values))
-
-
-def _operands(kernel, columns, lanes):
-    """What a reduction reads, and which of the results has the same place: triples of both, or None, and the type."""
-    graph, rank = kernel.graph, len(lanes)
-    free: dict[np.dtype, list[int]] = {}
-    for place, index in enumerate(kernel.results):
-        free.setdefault(graph.dtypes[index], []).append(place)
-    for column, indices, dtype in zip(columns, kernel.columns, kernel.types, strict=True):
-        for row, index in enumerate(indices):
-            bounds = [row, *(0 for _ in lanes)], [row + 1, *lanes], [1] * (rank + 1)
-            part = stablehlo.slice(column, *map(_integers, bounds))
-            part = stablehlo.reshape(_tensor(dtype, lanes), part)
-            twice = stablehlo.broadcast_in_dim(_tensor(dtype, (TWICE, *lanes)), part, _integers(range(1, rank + 1)))
-            places = free.get(dtype)
-            yield twice, index, places.pop(0) if places else None, dtype
-    for dtype, places in free.items():
-        for place in places:
-            shape = _tensor(dtype, (TWICE, *lanes))
-            yield stablehlo.broadcast_in_dim(shape, _constant(0, dtype), _integers([])), None, place, dtype
-
-
-def _lower(context, *columns, kernel: Kernel, lanes):
-    operands = list(_operands(kernel, columns, lanes))
-    types = [_tensor(dtype, lanes) for *_, dtype in operands]
-    scalars = [_tensor(dtype) for *_, dtype in operands]
-    start = [_constant(0, dtype) for *_, dtype in operands]
-    reduction = stablehlo.ReduceOp(types, [array for array, *_ in operands], start, _integers([0]))
-    block = reduction.regions[0].blocks.append(*scalars, *scalars)
+def _lower(context, spoils, *columns, kernel: Kernel, lanes: int):
+    graph = kernel.graph
+    kind = ir.Attribute.parse("#mhlo<fusion_kind kLoop>")
+    results = [_tensor(graph, index, lanes) for index in kernel.results]
+    operands = spoils, *columns
+    fusion = ir.Operation.create("mhlo.fusion", results, operands, {"fusion_kind": kind}, regions=1)
+    block = fusion.regions[0].blocks.append(*(operand.type for operand in operands))
+    integers = lambda number: ir.DenseI64ArrayAttr.get([number])
+    part = lambda column, row: stablehlo.slice(column, *map(integers, (row * lanes, (row + 1) * lanes, 1)))
     with ir.InsertionPoint(block):
-        entries = block.arguments[len(operands) :]
-        given = {index: entry for entry, (_, index, _, _) in zip(entries, operands, strict=True) if index is not None}
-        values = _emit(context, kernel, given)
-        stablehlo.return_(
-            [
-                entry if place is None else values[kernel.results[place]]
-                for entry, (_, _, place, _) in zip(entries, operands, strict=True)
-            ]
-        )
-    # A result that nobody reads sends a pass of StableHLO through the whole computation, for minutes.
-    found = stablehlo.OptimizationBarrierOp(list(reduction.results)).results
-    placed = {place: array for array, (_, _, place, _) in zip(found, operands, strict=True) if place is not None}
-    return [placed[place] for place in range(len(kernel.results))]
+        spoils, *columns = block.arguments
+        values, uses = {}, spoils
+        for column, indices in zip(columns, kernel.columns, strict=True):
+            *rows, last = [part(column, row) for row in range(len(indices) + 1)]
+            values.update(zip(indices, rows, strict=True))
+            uses = stablehlo.add(uses, stablehlo.convert(spoils.type, last))
+        _emit(context, kernel, values, lanes)
+        # XLA takes it for granted that a fusion uses all of its arguments, which have a last row for that, and
+        # that no result is a constant or a whole argument, as some might turn out to be.
+        sound, nothing = stablehlo.is_finite(uses), {}
+        for index in kernel.results:
+            if (dtype := graph.dtypes[index]) not in nothing:
+                nothing[dtype] = _nothing(spoils, _tensor(graph, index, lanes), lanes)
+            values[index] = stablehlo.select(sound, values[index], nothing[dtype])
+        ir.Operation.create("mhlo.return", operands=[values[index] for index in kernel.results])
+    return list(fusion.results)
 
 
-def _emit(context, kernel, given) -> dict[int, Any]:
-    """The scalars of a kernel in the body of a reduction."""
-    graph, values = kernel.graph, dict(given)
+def _nothing(spoils, tensor, lanes):
+    """NaN, zero or false, of a type, where `spoils` is NaN."""
+    if tensor.element_type == mlir.dtype_to_ir_type(np.dtype(bool)):
+        return _compare("gt", np.dtype(np.float32), spoils, mlir.ir_constant(np.ones(lanes, np.float32)))
+    return stablehlo.convert(tensor, spoils)
+
+
+def _tensor(graph, index, lanes):
+    return ir.RankedTensorType.get([lanes], mlir.dtype_to_ir_type(graph.dtypes[index]))
+
+
+def _aval(graph, index, lanes):
+    return ShapedArray((lanes,), graph.dtypes[index])
+
+
+def _emit(context, kernel, values, lanes) -> None:
+    """Add to the scalars that are given those that are computed from them."""
+    graph = kernel.graph
     for index in kernel.order:
         if index in values:
             continue
         name, operands, _ = graph.operations[index]
         arguments = [values[operand] for operand in operands]
         if name == KNOWN:
-            values[index] = _constant(graph.values[index], graph.dtypes[index])
+            values[index] = mlir.ir_constant(np.full(lanes, graph.values[index], graph.dtypes[index]))
         elif name in DIRECT:
             values[index] = DIRECT[name](*arguments)
         elif name == "select_n":
             which, false, true = arguments
             values[index] = stablehlo.select(which, true, false)
         elif name == "convert_element_type":
-            values[index] = stablehlo.convert(_tensor(graph.dtypes[index]), *arguments)
+            values[index] = stablehlo.convert(_tensor(graph, index, lanes), *arguments)
         elif name in COMPARISONS:
-            kind = _comparison_type(graph.dtypes[operands[0]])
-            direction = stablehlo.ComparisonDirectionAttr.get(name.upper())
-            left, right = arguments
-            values[index] = stablehlo.compare(left, right, direction, compare_type=kind)
+            values[index] = _compare(name, graph.dtypes[operands[0]], *arguments)
         else:
-            (values[index],) = _by_jax(context, graph, index, arguments)
-    return values
+            (values[index],) = _by_jax(context, graph, index, arguments, lanes)
 
 
-def _comparison_type(dtype):
+def _compare(name, dtype, left, right):
     kind = {"f": "FLOAT", "i": "SIGNED"}.get(dtype.kind, "UNSIGNED")
-    return stablehlo.ComparisonTypeAttr.get(kind)
+    direction = stablehlo.ComparisonDirectionAttr.get(name.upper())
+    return stablehlo.compare(left, right, direction, compare_type=stablehlo.ComparisonTypeAttr.get(kind))
 
 
-def _by_jax(context, graph, index, arguments):
+def _by_jax(context, graph, index, arguments, lanes):
     """An operation that JAX lowers, by its function of that name in `jax.lax`."""
     name, operands, params = graph.operations[index]
     function = lambda *scalars: getattr(lax, name)(*scalars, **dict(params))
-    scalar = lambda of: ShapedArray((), graph.dtypes[of])
-    inner = context.replace(avals_in=[scalar(of) for of in operands], avals_out=[scalar(index)])
+    inner = context.replace(
+        avals_in=[_aval(graph, of, lanes) for of in operands], avals_out=[_aval(graph, index, lanes)]
+    )
     return mlir.lower_fun(function, multiple_results=False)(inner, *arguments)
 
 

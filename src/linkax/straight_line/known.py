@@ -1,23 +1,25 @@
 """Which entries of arrays are known when a program is compiled: zeros, in matrices ones and minus ones too, as of axes.
 
 Other values are left to the arrays, so that a program serves for all that have these in the same places. A length that
-is one by chance stays a number like others.
+is one by chance stays a number like others. What is known of an array that a transformation traces, says who makes it
+(`remember`): it is the same array only as long as nothing is computed with it.
 """
 
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from linkax.straight_line.program import straighten
+from linkax.straight_line.program import Pattern, straighten
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import concrete
 
-Tree = TypeVar("Tree")
-Pattern = tuple[tuple[int, ...], bytes]  # shape, and the values that are known, NaN elsewhere, in double precision
+MOST_KEPT = 256  # of what functions make of known entries
 
 
 @dataclass(frozen=True)
@@ -28,31 +30,70 @@ class KnownEntries:
 
     @staticmethod
     def of(tree: Any) -> "KnownEntries":
-        """Those of vectors and matrices of real numbers that no transformation traces."""
-        return KnownEntries(tuple(_pattern(concrete(array)) for array in _arrays(tree)))
+        """Those of vectors and matrices of real numbers that are not traced, or are remembered."""
+        return KnownEntries(tuple(_pattern(known_values(array)) for array in _arrays(tree)))
 
-    def impose(self, tree: Tree) -> Tree:
-        """The same pytree, of whose arrays these entries are constants of the program that is traced."""
+    def through(self, function: Callable[..., Any], tree: Any, *details: Any) -> "KnownEntries":
+        """Those of the arrays that `function(tree, *details)` makes of a pytree with these; kept for each function."""
         dynamic, static = eqx.partition(tree, eqx.is_array)
         arrays, structure = jax.tree.flatten(dynamic)
-        found = [_imposed(array, pattern) for array, pattern in zip(arrays, self.patterns, strict=True)]
-        return eqx.combine(jax.tree.unflatten(structure, found), static)
+        fixed, of_fixed = jax.tree.flatten(static)
+        shapes = tuple((array.shape, array.dtype) for array in arrays)
+        return _through(function, details, structure, shapes, of_fixed, tuple(fixed), self)
 
-    def through(self, function: Callable[[Tree], Any], tree: Tree) -> "KnownEntries":
-        """Those of the arrays that a function makes of a pytree with these."""
-        dynamic, static = eqx.partition(tree, eqx.is_array)
-        arrays, structure = jax.tree.flatten(dynamic)
-        of = lambda *arrays: _arrays(function(eqx.combine(jax.tree.unflatten(structure, arrays), static)))
-        program = straighten(jax.make_jaxpr(of)(*arrays), [_values(pattern) for pattern in self.patterns], None)
-        graph = program.graph
 
-        def known(entries):
-            values = [graph.values[index] for index in entries.ravel().tolist()]
-            is_real = all(graph.dtypes[index].kind == "f" for index in entries.ravel().tolist())
-            numbers = [np.nan if value is None else float(value) for value in values] if is_real else None
-            return None if numbers is None else _pattern(np.reshape(numbers, entries.shape), ones=True)
+@lru_cache(maxsize=MOST_KEPT)
+def _through(function, details, structure, shapes, of_fixed, fixed, known):
+    static = jax.tree.unflatten(of_fixed, fixed)
 
-        return KnownEntries(tuple(known(entries) for entries in program.outputs))
+    def of(*arrays):
+        return _arrays(function(eqx.combine(jax.tree.unflatten(structure, arrays), static), *details))
+
+    traced = jax.make_jaxpr(of)(*(jax.ShapeDtypeStruct(*shape) for shape in shapes))
+    program = straighten(traced, known.patterns, None)
+    graph = program.graph
+
+    def pattern(entries):
+        indices = entries.ravel().tolist()
+        if any(graph.dtypes[index].kind != "f" for index in indices):
+            return None
+        values = [np.nan if (value := graph.values[index]) is None else float(value) for index in indices]
+        return _pattern(np.reshape(values, entries.shape), ones=True)
+
+    return KnownEntries(tuple(map(pattern, program.outputs)))
+
+
+_remembered: dict[int, np.ndarray] = {}  # of traced arrays that are alive, by their identity
+
+
+def remember(array: Array, values: np.ndarray) -> Array:
+    """Note which entries of an array that may be traced are known, those that are not NaN in `values`; return it."""
+    if concrete(array) is None and not np.all(np.isnan(values)):
+        _remembered[id(array)] = np.broadcast_to(values, array.shape)
+        weakref.finalize(array, _remembered.pop, id(array))
+    return array
+
+
+def known_values(array: Any) -> np.ndarray | None:
+    """The values of an array, NaN where they are not known; None where none is."""
+    known = concrete(array)
+    return _remembered.get(id(array)) if known is None else known
+
+
+class KnowsEntries(eqx.Module):
+    """A pytree of arrays, some entries of which straight lines may know: what `known` says, or none."""
+
+    known: KnownEntries | None = eqx.field(static=True)
+
+
+def patterns_of(tree: Any) -> list[Pattern | None]:
+    """For each array of a pytree what a `KnowsEntries` in it knows, or None."""
+    knows = lambda node: isinstance(node, KnowsEntries)
+    found = []
+    for node in jax.tree.leaves(tree, is_leaf=knows):
+        count = len(_arrays(node))
+        found += node.known.patterns if knows(node) and node.known is not None else [None] * count
+    return found
 
 
 def _arrays(tree):
@@ -66,14 +107,3 @@ def _pattern(array, ones=None) -> Pattern | None:
     known = (array == 0.0) | (ones & (np.abs(array) == 1.0))
     # A zero with a sign is a zero.
     return (array.shape, np.where(known, array + 0.0, np.nan).astype(float).tobytes()) if np.any(known) else None
-
-
-def _values(pattern: Pattern | None) -> np.ndarray | None:
-    return None if pattern is None else np.frombuffer(pattern[1]).reshape(pattern[0])
-
-
-def _imposed(array, pattern):
-    values = _values(pattern)
-    if values is None:
-        return array
-    return jnp.where(np.isnan(values), array, np.nan_to_num(values).astype(array.dtype))

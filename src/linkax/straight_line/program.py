@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
@@ -11,6 +12,7 @@ from linkax.straight_line.entries import Entries, NotStraight, is_known, known_e
 from linkax.straight_line.graph import Graph
 from linkax.straight_line.rules import RULES
 
+Pattern = tuple[tuple[int, ...], bytes]  # shape, and the values that are known, NaN elsewhere, in double precision
 MOST_PASSES = 64  # of a loop that is unrolled
 
 
@@ -34,11 +36,11 @@ class Program(NamedTuple):
     between: list[OnArrays]
 
 
-def straighten(traced: ClosedJaxpr, known: Sequence[np.ndarray | None], most: int | None) -> Program:
+def straighten(traced: ClosedJaxpr, known: Sequence[Pattern | None], most: int | None) -> Program:
     """Go through a traced function, entry by entry.
 
-    **Arguments:** `known`: for each argument its entries that are known, NaN elsewhere; or None. `most`: how many
-    scalar operations there may be.
+    **Arguments:** `known`: for each argument its entries that are known, or None. `most`: how many scalar operations
+    there may be.
 
     **Raises:** `TooLong` for more operations.
     """
@@ -53,7 +55,7 @@ def straighten(traced: ClosedJaxpr, known: Sequence[np.ndarray | None], most: in
 
 def _input(graph, aval, pattern=None) -> Entries:
     size = math.prod(aval.shape)
-    values = [math.nan] * size if pattern is None else np.ravel(pattern).tolist()
+    values = [math.nan] * size if pattern is None else np.frombuffer(pattern[1]).tolist()
     entries = [graph.input(aval.dtype) if math.isnan(value) else graph.known(value, aval.dtype) for value in values]
     return np.array(entries, dtype=int).reshape(aval.shape)
 
@@ -112,6 +114,11 @@ class _Walk:
 
     _pjit = _jit
 
+    def _straight_line(self, params, arrays):
+        if params["lanes"] is not None:
+            raise NotStraight
+        return self.closed(params["traced"].jaxpr, arrays)
+
     def _closed_call(self, params, arrays):
         return self.closed(params["call_jaxpr"], arrays)
 
@@ -152,7 +159,7 @@ class _Walk:
         return found
 
     def _scan(self, params, arrays):
-        if params["length"] > MOST_PASSES:
+        if params["length"] > MOST_PASSES or _has_straight_lines(params["jaxpr"]):
             raise NotStraight
         first, carried = _lengths_of_scan(params)
         constants, carry, rows = arrays[:first], arrays[first : first + carried], arrays[first + carried :]
@@ -169,6 +176,8 @@ class _Walk:
 
     def _while(self, params, arrays):
         """Unroll a loop whose condition is known."""
+        if _has_straight_lines(params["body_jaxpr"]):
+            raise NotStraight
         for_condition, for_body = params["cond_nconsts"], params["body_nconsts"]
         condition = arrays[:for_condition]
         body, carry = arrays[for_condition : for_condition + for_body], arrays[for_condition + for_body :]
@@ -180,6 +189,16 @@ class _Walk:
                 return carry
             carry = self.closed(params["body_jaxpr"], [*body, *carry])
         raise NotStraight
+
+
+def _has_straight_lines(traced: ClosedJaxpr | Jaxpr) -> bool:
+    """Whether a loop goes around straight lines: it stays one."""
+    inside = lambda value: [part for part in jax.tree.leaves(value) if isinstance(part, ClosedJaxpr | Jaxpr)]
+    return any(
+        equation.primitive.name == "straight_line"
+        or any(map(_has_straight_lines, inside(list(equation.params.values()))))
+        for equation in traced.eqns
+    )
 
 
 def _lengths_of_scan(params) -> tuple[int, int]:

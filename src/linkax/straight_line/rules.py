@@ -242,14 +242,14 @@ def _plain(function: Callable[[Any, Sequence[Entries]], Any]):
 
 
 _ACCURATE = {"sin", "cos", "tan", "sqrt", "rsqrt", "exp", "log", "tanh", "logistic", "exp2", "log1p", "expm1", "cbrt"}
-_OTHERS = (
+OTHERS = (
     *_ACCURATE,
     *("abs", "sign", "floor", "ceil", "is_finite", "atan2", "pow", "rem", "asin", "acos", "atan", "sinh", "cosh"),
     *("asinh", "acosh", "atanh", "erf", "erfc", "erf_inv", "lgamma", "digamma", "round", "nextafter", "xor"),
     *("shift_left", "shift_right_logical", "shift_right_arithmetic", "population_count", "clz"),
 )
 RULES: dict[str, Callable[..., list[Any]]] = {
-    **{name: _other(name) for name in _OTHERS},
+    **{name: _other(name) for name in OTHERS},
     **{name: _each_of(name) for name in ("add", "sub", "mul", "div", "neg", "max", "min")},
     **{name: _compared(name) for name in ("lt", "le", "gt", "ge", "eq", "ne")},
     "add_any": _each_of("add"),

@@ -1,7 +1,7 @@
 """`straight_line`: a function of arrays as a straight line, with derivatives in both modes, and batches over lanes."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, cached_property, partial, wraps
 from typing import Any, TypeVar
 
@@ -17,14 +17,14 @@ from jaxlib import version as jaxlib
 
 from linkax.straight_line.graph import TooLong
 from linkax.straight_line.kernel import Kernel
-from linkax.straight_line.program import Program, straighten
+from linkax.straight_line.known import patterns_of
+from linkax.straight_line.program import Pattern, Program, straighten
 from linkax.xla.flags import WHOLE_LOOP_BYTES, makes_kernels_of_loops
 from linkax.xla.tracing import all_concrete, evaluate_now
 
 Output = TypeVar("Output")
 
-MOST_OPERATIONS = 10_000  # scalar ones, which take some seconds to compile
-MOST_FUSED = 1200  # where XLA makes no kernel of a loop, but fuses: of more it computes some again and again
+MOST_OPERATIONS = 30_000  # scalar ones, which take some seconds to compile
 LANES = 256  # that are computed together, in the cache of a processor
 BYTES_OF_A_LANE = 8 * 8  # of each argument and result, with copies
 
@@ -32,16 +32,16 @@ BYTES_OF_A_LANE = 8 * 8  # of each argument and result, with copies
 def straight_line(function: Callable[..., Output], most: int = MOST_OPERATIONS) -> Callable[..., Output]:
     """Decorate a function of pytrees of arrays: compute it as a straight line of scalar operations.
 
-    What folds keeps its rounding, but for the order of sums, and that 0·x is 0. Where a number that it computes with is
-    not finite, results are not a number. A function of more than `most` operations stays on arrays, as does all of it
-    on other devices than a CPU. Differentiable in both modes, to any order, as the function itself is.
+    What folds keeps its rounding, but for the order of sums, and that 0·x is 0. Where a number of its arguments that
+    results are computed with is not finite, they are not a number. A function of more than `most` operations stays on
+    arrays, as does all of it on other devices than a CPU. Differentiable in both modes, to any order, as the function
+    itself is. What a `KnowsEntries` among its arguments knows, folds.
     """
 
     @wraps(function)
     def straight(*args):
         if not computes_kernels():
             return function(*args)
-        allowed = most if makes_kernels_of_loops() else min(most, MOST_FUSED)
         dynamic, static = eqx.partition(args, eqx.is_array)
         leaves, tree = jax.tree.flatten(dynamic)
 
@@ -50,11 +50,9 @@ def straight_line(function: Callable[..., Output], most: int = MOST_OPERATIONS) 
 
         made, shapes = jax.make_jaxpr(of_leaves, return_shape=True)(*leaves)
         traced, outside = _without_tracers(made)
-        traced = Traced(traced, allowed)
-        if not traced.is_straight:
-            return function(*args)
+        traced = Traced(traced, [*(None for _ in outside), *patterns_of(args)], most)
         operands = *outside, *leaves
-        found = _straight.bind(*operands, traced=traced, lanes=None, batched=(False,) * len(operands))
+        found = _computed(*operands, traced=traced, lanes=None, batched=(False,) * len(operands))
         return jax.tree.unflatten(jax.tree.structure(shapes), found)
 
     return straight
@@ -63,9 +61,11 @@ def straight_line(function: Callable[..., Output], most: int = MOST_OPERATIONS) 
 @cache
 def computes_kernels() -> bool:
     """Whether XLA computes kernels as they are meant, which no version promises: one is tried. Warns where not."""
+    if not makes_kernels_of_loops():
+        return False
     function = lambda x, y: (jnp.sin(x) * y - x, x > y)
     given = np.array([0.5, 0.25]), np.array([0.125, 3.0])
-    traced = Traced(jax.make_jaxpr(function)(0.5, 0.125), most=10)
+    traced = Traced(jax.make_jaxpr(function)(0.5, 0.125), known=(None, None), most=10)
     program = jax.jit(partial(_in_kernels, traced=traced, lanes=len(given[0]), batched=(True, True)))
     found, expected = evaluate_now(program, *given), (np.sin(given[0]) * given[1] - given[0], given[0] > given[1])
     right = all(np.allclose(a, b, rtol=1e-6) for a, b in zip(found, expected, strict=True))
@@ -97,10 +97,13 @@ def _without_tracers(made: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
 
 
 class Traced:
-    """A traced function of arrays, and what has been made of it. Two are the same where they are one object."""
+    """A traced function of arrays, and what has been made of it. Two are the same where they are one object.
 
-    def __init__(self, jaxpr: ClosedJaxpr, most: int) -> None:
-        self.jaxpr, self.most = jaxpr, most
+    `known`, `most`: see `linkax.straight_line.program.straighten`.
+    """
+
+    def __init__(self, jaxpr: ClosedJaxpr, known: Sequence[Pattern | None], most: int) -> None:
+        self.jaxpr, self.known, self.most = jaxpr, known, most
         self.function = jaxpr_as_fun(jaxpr)
         self.inputs = [ShapedArray(variable.aval.shape, variable.aval.dtype) for variable in jaxpr.jaxpr.invars]
         self.outputs = [ShapedArray(aval.shape, aval.dtype) for aval in jaxpr.out_avals]
@@ -111,7 +114,7 @@ class Traced:
     def program(self) -> Program | None:
         """Its straight line; None where that is too long, or none of it is one."""
         try:
-            program = straighten(self.jaxpr, [None] * len(self.inputs), self.most)
+            program = straighten(self.jaxpr, self.known, self.most)
         except TooLong:
             return None
         return program if program.graph.count or not program.between else None
@@ -135,7 +138,8 @@ class Traced:
             return [tangent for tangent, has in zip(found, self.has_tangents, strict=True) if has]
 
         moving = [aval for aval, does in zip(self.inputs, moves, strict=True) if does]
-        return Traced(jax.make_jaxpr(tangents)(*self.inputs, *moving), self.most)
+        known = *self.known, *(None for _ in moving)
+        return Traced(jax.make_jaxpr(tangents)(*self.inputs, *moving), known, self.most)
 
     def _transposed(self, linear: tuple[bool, ...]) -> "Traced":
         """The function of the other arguments, and cotangents of results, to cotangents of the linear arguments."""
@@ -153,7 +157,9 @@ class Traced:
             return jax.vjp(of_linear, *at_zero)[1](given)
 
         fixed = [aval for aval, of in zip(self.inputs, linear, strict=True) if not of]
-        return Traced(jax.make_jaxpr(cotangents)(*fixed, *self.outputs), self.most)
+        known = [pattern for pattern, of in zip(self.known, linear, strict=True) if not of]
+        known += [None] * len(self.outputs)
+        return Traced(jax.make_jaxpr(cotangents)(*fixed, *self.outputs), known, self.most)
 
     def _compiled(self, lanes, batched):
         """A program of its own, for calls outside of others; kept with this object, and no longer."""
@@ -202,7 +208,7 @@ def _in_kernels(*operands, traced: Traced, lanes: int | None, batched: tuple[boo
         wanted = dict.fromkeys(index for entries in parts for index in entries.ravel().tolist())
         wanted = [index for index in wanted if index not in scalars and graph.values[index] is None]
         if wanted:
-            kernel = Kernel(graph, scalars, wanted)
+            kernel = Kernel(graph, scalars, wanted, arguments)
             scalars.update(zip(wanted, kernel(scalars, shape), strict=True))
 
     def dense(entries, aval):
@@ -216,6 +222,7 @@ def _in_kernels(*operands, traced: Traced, lanes: int | None, batched: tuple[boo
 
     for entries, array, is_batched in zip(program.inputs, operands, batched, strict=True):
         keep(entries, array, is_batched)
+    arguments = set(scalars)
     for part in program.between:
         produce(part.reads)
         function = jaxpr_as_fun(part.traced)
@@ -229,7 +236,8 @@ def _in_kernels(*operands, traced: Traced, lanes: int | None, batched: tuple[boo
 
 def _lanes_together(program):
     """As many lanes as make the loop in a `Kernel` a small one for XLA."""
-    entries = sum(part.size for part in (*program.inputs, *program.outputs))
+    inside = [entries for part in program.between for entries in (*part.reads, *part.returns)]
+    entries = sum(part.size for part in (*program.inputs, *program.outputs, *inside))
     return max(1, min(LANES, WHOLE_LOOP_BYTES // (BYTES_OF_A_LANE * max(entries, 1))))
 
 

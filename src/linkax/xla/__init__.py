@@ -27,8 +27,9 @@ used. What would have to be found another way:
 - `jax.extend.core` Jaxpr and Literal, names and parameters of JAX's primitives (`straight_line.program`,
   `straight_line.rules`); `jax.extend.mlir` (`straight_line.kernel`); `jax.interpreters` (`straight_line.transform`):
   straight lines. A primitive that is not known there stays on arrays.
-- that XLA computes a reduction over two entries by its computation, in their order (`straight_line.kernel`), which is
-  tried: without it runs take several times as long; a warning says so.
+- that XLA takes a fusion from a program, of the dialect `mhlo`, and compiles it in the kernel of a loop
+  (`straight_line.kernel`; jaxlib 0.10, known up to 0.12), which is tried. Without it: runs take several times as long;
+  a warning says so. Outside of such a loop, or with constants or arguments as results, a fusion ends the process.
 - `jax.custom_derivatives.SymbolicZero` (`derivatives`): which arguments have no tangent.
 - `jax.custom_batching.custom_vmap`, `jax.lax.platform_dependent` (`one_kernel`, `batches`): batches faster than their
   members one by one, and without LAPACK that waits for ever (`one_by_one`).

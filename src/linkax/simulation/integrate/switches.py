@@ -46,7 +46,7 @@ def held(system: System, sides: Sides) -> System:
     """Hold the force elements of a system on the given sides of their switches, (m,), 1 or −1."""
     each = iter(sides)
     forces = tuple(Held(force, next(each)) if has_switch(force) else force for force in system.forces)
-    return dataclasses.replace(system, forces=forces)
+    return dataclasses.replace(system, forces=forces, known=None)
 
 
 def values(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Float[Array, " m"]:
