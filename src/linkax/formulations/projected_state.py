@@ -26,6 +26,7 @@ from linkax.linalg.block_elimination import Factors
 from linkax.linalg.least_multipliers import least_multipliers
 from linkax.linalg.while_falling import while_falling
 from linkax.spatial.vectors import largest
+from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import positive_or_one, ratio
 from linkax.xla.tracing import jit_inline
@@ -112,9 +113,16 @@ def _close_jvp(primals, tangents):
     (arguments,), (tangents,) = primals, tangents
     method, system, t, _, _ = arguments
     q, v = close(arguments)
+    # Apart from their structure: that of a system says what is known of its numbers, and not of their tangents.
+    return (q, v), _closed_tangent((method, system, t, q, v), *jax.tree.flatten(tangents[1:]))
+
+
+@straight_line
+def _closed_tangent(arguments, tangents, structure):
+    method, system, t, q, v = arguments
     linear = linear_system(system, t, q)
-    state = _state_tangent(method, linear, v, method.split(linear), tangents[1:])
-    return (q, v), (state.to_q, state.to_v)
+    state = _state_tangent(method, linear, v, method.split(linear), jax.tree.unflatten(structure, tangents))
+    return state.to_q, state.to_v
 
 
 def approach(
@@ -124,17 +132,23 @@ def approach(
     small = ROUNDING_ULPS * jnp.finfo(q.dtype).eps
 
     def improve(state, before):
-        q, _, _ = state
-        linear = linear_system(system, t, q)
-        split = method.split(linear)
-        gap = largest(residual(linear.configuration))
-        done = (gap <= small) | (gap >= before)
-        q = jnp.where(done, q, method.correct_position(linear, split, linear.configuration))
-        v_there = method.correct_velocity(linear, split, v, refinements=1)
-        return (q, v_there, split.distance), gap
+        return _improved((method, system, t, state[0], v), before, small)
 
     begin = on_manifold(system.topology, q), v, jnp.ones((), q.dtype)
     return while_falling(improve, begin, MOST_CORRECTIONS, small, q.dtype)
+
+
+@jit_inline
+@straight_line
+def _improved(arguments, before, small):
+    """The state after a Newton step from q, as long as gaps fall, and the gap at q."""
+    method, system, t, q, v = arguments
+    linear = linear_system(system, t, q)
+    split = method.split(linear)
+    gap = largest(residual(linear.configuration))
+    done = (gap <= small) | (gap >= before)
+    q = jnp.where(done, q, method.correct_position(linear, split, linear.configuration))
+    return (q, method.correct_velocity(linear, split, v, refinements=1), split.distance), gap
 
 
 def ranks_along(
@@ -211,21 +225,29 @@ def _limit(function, powers, method, system, t, q, v):
 
 
 @jit_inline
+@straight_line
 def _acceleration_at(arguments, t, q) -> Value:
-    method, system, v = arguments
-    found = evaluate((method, system, t, q, v), True)
-    return Value((found.q, found.acceleration), found.split.distance, _gap(system, t, q))
+    found, gap = _evaluate_near(arguments, t, q)
+    return Value((found.q, found.acceleration), found.split.distance, gap)
 
 
 @jit_inline
+@straight_line
 def _multipliers_at(arguments, t, q) -> Value:
     method, system, v = arguments
-    found = evaluate((method, system, t, q, v), True)
+    found, gap = _evaluate_near(arguments, t, q)
     rows, rank = linear_system(system, t, found.q).jacobian, jnp.sum(found.split.rank)
     least = least_multipliers(rows, found.multipliers, system.scales, method.tolerance, rank)
     undefined = (found.split.distance < method.tolerance) & jnp.any(v != 0.0)
     per_inertia = jnp.where(undefined, jnp.nan, least.multipliers / _inertia(system))
-    return Value((found.q, per_inertia), found.split.distance, _gap(system, t, q))
+    return Value((found.q, per_inertia), found.split.distance, gap)
+
+
+def _evaluate_near(arguments, t, q) -> tuple[Evaluated, Float[Array, ""]]:
+    """The evaluation on the loops, and how far q is from them: a correction of rounding alone would be amplified."""
+    method, system, v = arguments
+    gap = _gap(system, t, q)
+    return evaluate((method, system, t, q, v), gap > ROUNDING_ULPS * jnp.finfo(q.dtype).eps), gap
 
 
 @jit_inline

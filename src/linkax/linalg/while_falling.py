@@ -21,8 +21,8 @@ def while_falling(
 ) -> Carry:
     """Iterate until the residual is small, stops falling, or `most` iterations are done; at least once.
 
-    **Arguments:** `improve`: (state, residual of the iteration before, infinite at first) ↦ (state, residual); `begin`:
-    the first state; `dtype`: floating-point type of the residual.
+    **Arguments:** `improve`: (state, residual of the iteration before, at first as large as can be) ↦ (state,
+    residual); `begin`: the first state; `dtype`: floating-point type of the residual.
 
     **Returns:** the last state.
     """
@@ -36,5 +36,5 @@ def while_falling(
         state, missed = improve(state, before)
         return count + 1, state, missed, before
 
-    infinite = jnp.asarray(jnp.inf, dtype)
-    return lax.while_loop(unfinished, iterate, (jnp.zeros((), int), begin, infinite, infinite))[1]
+    largest = jnp.asarray(jnp.finfo(dtype).max, dtype)
+    return lax.while_loop(unfinished, iterate, (jnp.zeros((), int), begin, largest, largest))[1]

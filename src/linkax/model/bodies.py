@@ -14,6 +14,7 @@ from linkax.model.numbers import (
     Matrix,
     Number,
     Vector,
+    like,
     namespace,
     number,
     positive,
@@ -22,6 +23,7 @@ from linkax.model.numbers import (
     rotation_matrix,
     zero_or_more,
 )
+from linkax.straight_line.known import known_values
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
@@ -183,7 +185,8 @@ def inertia_tensor(inertia: Matrix, what: str) -> Float[Array, "3 3"]:
     diagonal = _depth(inertia) == 1
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)
     if diagonal:
-        tensor = tensor * np.eye(3)
+        known = known_values(tensor)
+        tensor = like(tensor * np.eye(3), np.eye(3) * (1.0 if known is None else known))
     tensor = require(tensor, _is_symmetric, what, "it must be symmetric")
     moments = _principal_moments(tensor, diagonal)
     sizes = "" if concrete(moments) is None else f" {moments.tolist()}"
@@ -217,13 +220,13 @@ def rod(name: str, length: Number, mass: Number) -> RigidBody:
     """
     length = positive(length, f"rod {name!r}: length [m]")
     mass = number(mass, (), f"body {name!r}: mass [kg]")
-    along = np.array([1.0, 0.0, 0.0])
+    across = mass * length**2 / 12
     return RigidBody(
         name,
         mass,
-        center_of_mass=length / 2 * along,
-        inertia=mass * length**2 / 12 * (1.0 - along),
-        frames={"base": 0.0 * along, "tip": length * along},
+        center_of_mass=[length / 2, 0.0, 0.0],
+        inertia=[0.0, across, across],
+        frames={"base": [0.0, 0.0, 0.0], "tip": [length, 0.0, 0.0]},
     )
 
 

@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Float
 
 from linkax.spatial.rotations import COORDINATE_AXES
+from linkax.straight_line.known import known_values, remember
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
@@ -84,10 +85,18 @@ def _in_double(entry: Any) -> Array:
     if isinstance(entry, jax.Array):
         return jnp.asarray(entry, dtype=float)
     if any(isinstance(part, jax.Array) for part in jax.tree.leaves(entry)):
-        return jnp.stack([jnp.asarray(part, dtype=float) for part in entry])
+        return remember(jnp.stack([jnp.asarray(part, dtype=float) for part in entry]), _known_parts(entry))
     array = np.array(entry, dtype=np.float64)  # not that of the caller, which may change
     array.flags.writeable = False
     return array
+
+
+def _known_parts(entry):
+    """The entries of nested lists that are not traced, NaN for the others."""
+    if isinstance(entry, list | tuple):
+        return np.array([_known_parts(part) for part in entry])
+    known = concrete(entry)
+    return np.full(np.shape(entry), np.nan) if known is None else known
 
 
 def converted(entry: Any, what: str, convert: Callable[[Any], Kind]) -> Kind:
@@ -160,10 +169,16 @@ def require(array: Array, condition: Callable[[Array], Any], what: str, remedy: 
     known = concrete(array)
     met = condition(lax.stop_gradient(array) if known is None else known)
     if concrete(met) is None:
-        return jnp.where(met, array, jnp.nan)
+        return like(jnp.where(met, array, jnp.nan), array)
     if not met:
         raise ValueError(f"{what} is {np.asarray(array).tolist()}; {remedy}")
     return array
+
+
+def like(array: Array, other: Array) -> Array:
+    """An array that is zero where another one is known to be."""
+    known = known_values(other)
+    return array if known is None else remember(array, np.where(known == 0.0, 0.0, np.nan))
 
 
 def positive(entry: Any, what: str, remedy: str = "it must be positive") -> Scalar:
@@ -186,7 +201,7 @@ def unit_axis(axis: Axis, what: str) -> Constant | Float[Array, "3"]:
     remedy = "its length is zero or infinite; give a nonzero vector of finite length"
     vector = require(number(axis, (3,), what), lambda entries: _is_length(_norm(entries)), what, remedy)
     unit = vector / _norm(vector)
-    return Constant(unit) if isinstance(vector, np.ndarray) else unit
+    return Constant(unit) if isinstance(vector, np.ndarray) else like(unit, vector)
 
 
 def _norm(vector: Array) -> Any:

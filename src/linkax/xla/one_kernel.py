@@ -1,21 +1,19 @@
-"""A computation as one kernel of the CPU, or as a branch that XLA does not inline."""
+"""A computation as one kernel of the CPU."""
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from linkax.xla.arrays import Array
 from linkax.xla.flags import makes_kernels_of_loops
 from linkax.xla.products_as_sums import with_products_as_sums
 from linkax.xla.tracing import jit_inline
-
-Output = TypeVar("Output")
 
 
 def in_one_kernel(
@@ -76,13 +74,3 @@ def _alone_in_a_loop(plain, shapes):
 
 def _undefined(shape):
     return jnp.full(shape.shape, jnp.nan if jnp.issubdtype(shape.dtype, jnp.inexact) else 0, shape.dtype)
-
-
-def where_finite(function: Callable[[Array], Output], array: Float[Array, "..."], otherwise: Output) -> Output:
-    """Compute function(array) as a branch of its own where the array is finite; elsewhere return `otherwise`.
-
-    The branch is for speed: XLA runs a computation on the CPU without the cost of scheduling its parts (half of the
-    time for a small mechanism) where it touches small arrays only, and inlined into a solver's step it would touch the
-    tables of the solver.
-    """
-    return lax.cond(jnp.all(jnp.isfinite(array)), function, lambda array: otherwise, array)

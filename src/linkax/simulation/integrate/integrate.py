@@ -26,6 +26,7 @@ from linkax.simulation.integrate.switches import start_sides
 from linkax.simulation.start.initial_state import InitialCheck, check_initial_state
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
+from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import Program, concrete, quick_compile
 from linkax.xla.undefined import undefined_where
@@ -42,29 +43,35 @@ class Outcome(NamedTuple):
 
 def integrate_run(run: Run) -> Outcome:
     """Integrate a run, in three programs: another solver, formulation or saveat compiles no more than it must."""
-    initial = _check_start(run.mechanism, run.state, run.t0, run.tangent_space)
+    initial = _check_start(run.mechanism, run.known, run.state, run.t0, run.tangent_space)
     if concrete(sound := sound_numbers(run.mechanism)) is None:
         initial = initial.of_numbers(sound)
     integrated = _integrate.choose(run.quick, run, initial)(run, initial)
     saveat: Any = run.options.saveat
     given = (integrated.ts, integrated.t_end), (integrated.ys, integrated.y_end), saves_states(saveat), _firsts(run)
-    given = run.mechanism, run.formulation, run.accuracy, initial, *given
+    given = run.mechanism, run.known, run.formulation, run.accuracy, initial, *given
     return Outcome(initial, integrated, *_closed.choose(run.quick, *given)(*given))
 
 
 @quick_compile
-def _check_start(mechanism, state, t0, tangent_space) -> InitialCheck:
+def _check_start(mechanism, known, state, t0, tangent_space) -> InitialCheck:
     dtype = state.q.dtype
-    return check_initial_state(tangent_space.prepared(dtype), system_of(mechanism, dtype), t0, state)
+    return check_initial_state(tangent_space.prepared(dtype), system_of(mechanism, dtype, known=known), t0, state)
 
 
 def problem_of(
-    mechanism: Mechanism, formulation: AbstractFormulation, accuracy: Accuracy, initial: InitialCheck
+    mechanism: Mechanism,
+    known: KnownEntries,
+    formulation: AbstractFormulation,
+    accuracy: Accuracy,
+    initial: InitialCheck,
 ) -> Problem:
     """The initial value problem's right-hand side from a state that was checked."""
     dtype = initial.state.q.dtype
     start = initial.can_start, initial.t, initial.singular
-    return Problem(mechanism, system_of(mechanism, dtype), formulation.prepared(dtype, initial.rank), accuracy, *start)
+    return Problem(
+        mechanism, system_of(mechanism, dtype, known=known), formulation.prepared(dtype, initial.rank), accuracy, *start
+    )
 
 
 @Program
@@ -72,7 +79,7 @@ def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     dtype = initial.state.q.dtype
     formulation, t0, t1, options, control = cast((run.formulation, run.t0, run.t1, run.options, run.control), dtype)
     in_order, t0, t1, dt0, saveat = _in_order(t0, t1, options.dt0, options.saveat)
-    problem = problem_of(run.mechanism, formulation, run.accuracy, initial)
+    problem = problem_of(run.mechanism, run.known, formulation, run.accuracy, initial)
     problem = eqx.tree_at(lambda p: p.can_start, problem, problem.can_start & in_order)
     inputs = run.mechanism, initial.state, t0, t1, dt0, saveat
     if not saves_states(saveat):
@@ -178,9 +185,11 @@ def _firsts(run):
 
 
 @Program
-def _closed(mechanism, formulation, accuracy, initial, times, values, saves, firsts) -> tuple[State, State | None]:
+def _closed(
+    mechanism, known, formulation, accuracy, initial, times, values, saves, firsts
+) -> tuple[State, State | None]:
     """The state at the end, and those that are saved, on the loops; infinite where none was saved."""
-    problem = problem_of(mechanism, formulation, accuracy, initial)
+    problem = problem_of(mechanism, known, formulation, accuracy, initial)
     (ts, t_end), (ys, y_end) = times, values
     if not saves:
         return problem.close(t_end, y_end), None

@@ -1,6 +1,5 @@
 """The ordinary differential equation of a mechanism's motion."""
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -17,8 +16,9 @@ from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack
 from linkax.simulation.integrate.switches import Sides, held, values
 from linkax.simulation.start.state import State
+from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
-from linkax.xla.one_kernel import where_finite
+from linkax.xla.tracing import jit_inline
 
 Errors = tuple[Float[Array, " n_v"], Float[Array, " n_v"]]  # of coordinates and speeds, as changes of both
 
@@ -65,6 +65,8 @@ class Problem(eqx.Module):
         of_q, of_v = self.unpacked(error)
         return speeds(self.system.topology, self.unpacked(y)[0], of_q), of_v
 
+    @jit_inline
+    @straight_line
     def derivative(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " n"]:
         """ẏ = (0, q̇, v̇, d) at (t, y)."""
         correct = self.accuracy.projection in ("both", "stage") and t != self.closed_at
@@ -74,19 +76,15 @@ class Problem(eqx.Module):
         still = jax.tree.map(jnp.zeros_like, sides)
         return pack(still, rates(system.topology, q, v), acceleration, distance)
 
+    @jit_inline
+    @straight_line
     def corrected(
         self, t: Float[Array, ""], y: Float[Array, " n"], error: Float[Array, " n"] | None = None
     ) -> tuple[Float[Array, " n"], tuple[Float[Array, " n_v"], ...] | None, Float[Array, ""]]:
         """A vector after a step and its error estimate, both corrected, and the distance d there."""
         errors = () if error is None else self.errors(y, error)
-
-        def correct(y):
-            q, v, errors_left, distance = self.method.correct(self.system, t, *self.unpacked(y), errors)
-            return pack(self.sides(y), q, v, integral_of_distance(y)), errors_left, distance
-
-        undefined = jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), (y, errors))
-        y, errors, distance = where_finite(correct, y, (*undefined, jnp.ones((), y.dtype)))
-        return y, None if error is None else errors, distance
+        q, v, errors, distance = self.method.correct(self.system, t, *self.unpacked(y), errors)
+        return pack(self.sides(y), q, v, integral_of_distance(y)), None if error is None else errors, distance
 
     def close(self, t: Float[Array, ""], y: Float[Array, " n"]) -> State:
         """The `State` on the manifold to rounding."""
@@ -94,5 +92,5 @@ class Problem(eqx.Module):
 
 
 def derivative(t: Any, y: Float[Array, " n"], problem: Problem) -> Float[Array, " n"]:
-    """The right-hand side of diffrax: `Problem.derivative`; not a number where y is not."""
-    return where_finite(partial(problem.derivative, t), y, jnp.full_like(y, jnp.nan))
+    """The right-hand side of diffrax: `Problem.derivative`."""
+    return problem.derivative(t, y)

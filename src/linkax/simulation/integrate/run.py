@@ -32,6 +32,7 @@ from linkax.simulation.integrate.options import (
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time
+from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import all_concrete, concrete
 
@@ -72,6 +73,7 @@ class Run(eqx.Module):
     - `formulation`: of the equations of motion. `accuracy`: tolerances and projection.
     - `optimise`: see `linkax.simulate`.
     - `saves_times`: whether states are saved at given times, and nothing else.
+    - `known`: which entries of the mechanism's arrays its programs may know.
     """
 
     mechanism: Mechanism
@@ -82,6 +84,7 @@ class Run(eqx.Module):
     accuracy: Accuracy
     optimise: bool = eqx.field(static=True)
     saves_times: bool = eqx.field(static=True)
+    known: KnownEntries = eqx.field(static=True)
     _options: DiffraxOptions | _Frozen | None
 
     @staticmethod
@@ -110,16 +113,18 @@ class Run(eqx.Module):
         check_kinds(**{name: entry for name, entry in given.items() if name not in ("dt0", "max_steps")})
         formulation = checked_formulation(formulation, accuracy)
         options = _filled_in(mechanism, accuracy, t0, t1, **given)
+        known = KnownEntries.of(mechanism)
         mechanism, state, t0, accuracy = cast((mechanism, state, t0, accuracy), dtype)
         saves = saves_times(options.saveat)
-        return Run(mechanism, state, t0, t1, formulation, accuracy, optimise, saves, options)
+        return Run(mechanism, state, t0, t1, formulation, accuracy, optimise, saves, known, options)
 
     @staticmethod
     def of_state(
         mechanism: Mechanism, state: State, t: ScalarLike, formulation: AbstractFormulation, accuracy: Accuracy
     ) -> "Run":
         """What a state alone says of a run: nothing is stepped."""
-        return Run(mechanism, state, t, t, formulation, accuracy, True, False, None)
+        known = KnownEntries.of(mechanism)
+        return Run(mechanism, state, t, t, formulation, accuracy, True, False, known, None)
 
     @property
     def is_integrated(self) -> bool:

@@ -19,7 +19,6 @@ from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.projected_solver import ProjectedSolver
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise
-from linkax.xla.one_kernel import where_finite
 from linkax.xla.products_as_sums import with_products_as_sums
 
 
@@ -88,13 +87,6 @@ def _step(solver: ProjectedSolver, problem: Problem, t0, t1, y0, sides):
     return solver.corrected(problem, t1, dense["y1"], sides), dense
 
 
-def _vjp(function, primals, cotangent):
-    """VJP of a function at primals; not a number where the cotangent is not."""
-    pull = lambda cotangent: jax.vjp(function, *primals)[1](cotangent)
-    undefined = jax.tree.map(lambda array: jnp.full_like(array, jnp.nan), primals)
-    return where_finite(pull, cotangent, undefined)
-
-
 def _step_vjp(solver: ProjectedSolver, of_problem, problem, t0, t1, dense, sides, y1_bar, dense_bar):
     """VJP of one step: cotangents of (y1, dense output) ↦ cotangents of (problem, t0, t1, y0).
 
@@ -106,7 +98,7 @@ def _step_vjp(solver: ProjectedSolver, of_problem, problem, t0, t1, dense, sides
     result = jnp.asarray(table.result, y0.dtype)
     corrected = lambda problem, t, y: solver.corrected(of_problem(problem), t, y, sides)
     rates = lambda problem, t, y: of_problem(problem).derivative(t, y)
-    problem_bar, t1_bar, y_bar = _vjp(corrected, (problem, t1, dense["y1"]), y1_bar)
+    problem_bar, t1_bar, y_bar = jax.vjp(corrected, problem, t1, dense["y1"])[1](y1_bar)
     y_bar = y_bar + dense_bar["y1"]
     k_bar = dense_bar["k"] + result[:, None] * y_bar
 
@@ -114,7 +106,7 @@ def _step_vjp(solver: ProjectedSolver, of_problem, problem, t0, t1, dense, sides
         problem_bar, t0_bar, t1_bar, y_bar, k_bar = carry
         i = len(nodes) - 1 - back
         at = problem, t0 + nodes[i] * duration, y0 + weights[i] @ k
-        more, t_bar, stage_bar = _vjp(rates, at, duration * k_bar[i])
+        more, t_bar, stage_bar = jax.vjp(rates, *at)[1](duration * k_bar[i])
         stretch = k[i] @ k_bar[i] / duration
         return (
             jax.tree.map(jnp.add, problem_bar, more),

@@ -19,6 +19,8 @@ from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
 from linkax.simulation.start.state import State
+from linkax.straight_line.known import KnownEntries
+from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import Program, all_concrete
 
@@ -37,7 +39,7 @@ def read(function: Callable[..., Any], solution: Solution, *details: Any, dynami
     topology, run = solution.mechanism.topology, solution.run
     few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
     states = solution.ts, solution.q, solution.v
-    motion = SavedMotion(run.mechanism, run.formulation, run.tangent_space, solution.rank_nearby, *states)
+    motion = SavedMotion(run.mechanism, run.known, run.formulation, run.tangent_space, solution.rank_nearby, *states)
     given = function, motion, dynamics, details
     compute = lambda: _of_times.choose(few, *given)(*given)
     named = all(isinstance(detail, str) for detail in details)
@@ -50,6 +52,7 @@ class SavedMotion(NamedTuple):
     """What is read: with another solver or tolerance the same program reads it."""
 
     mechanism: Mechanism
+    known: KnownEntries
     formulation: AbstractFormulation
     tangent_space: TangentSpace
     rank_nearby: Int[Array, "*batch k"] | None
@@ -76,13 +79,13 @@ def _kept(solution, key, compute):
 def _of_times(function, motion: SavedMotion, dynamics, details):
     def of_member(motion, dynamics, details):
         dtype = motion.q.dtype
-        system = system_of(motion.mechanism, dtype, fixed_scales=False)
+        system = system_of(motion.mechanism, dtype, fixed_scales=False, known=motion.known)
         tangent_space = motion.tangent_space.prepared(dtype, motion.rank_nearby)
         method = motion.formulation.prepared(dtype, motion.rank_nearby)
 
         def of_time(t, q, v, *dynamics):
             found = Dynamics(*dynamics) if dynamics else None
-            return function(Observables(system, method, tangent_space, t, q, v, found), *details)
+            return straight_line(function)(Observables(system, method, tangent_space, t, q, v, found), *details)
 
         return map_saved_times(of_time, jnp.isfinite(motion.ts), motion.ts, motion.q, motion.v, *dynamics)
 
@@ -94,6 +97,7 @@ def _of_times(function, motion: SavedMotion, dynamics, details):
 @eqx.filter_jit
 def evaluate_dense(
     mechanism: Mechanism,
+    known: KnownEntries,
     formulation: AbstractFormulation,
     accuracy: Accuracy,
     rank_nearby: Int[Array, " k"] | None,
@@ -103,6 +107,5 @@ def evaluate_dense(
     dtype = interpolation.t0.dtype
     t = jnp.asarray(t, dtype)
     y = interpolation.evaluate(t)
-    return Problem(mechanism, system_of(mechanism, dtype), formulation.prepared(dtype, rank_nearby), accuracy).close(
-        t, y
-    )
+    system, method = system_of(mechanism, dtype, known=known), formulation.prepared(dtype, rank_nearby)
+    return Problem(mechanism, system, method, accuracy).close(t, y)

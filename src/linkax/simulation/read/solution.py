@@ -319,7 +319,8 @@ class Solution(eqx.Module):
         if first is not None and last is not None and first.shape == ():
             during = lambda t: (t >= first) & (t <= last)
             t = require(t, during, "t [s]", f"give a time of the run, from {first} s to {last} s")
-        return evaluate_dense(self.mechanism, self.formulation, self.accuracy, self.rank_nearby, self.interpolation, t)
+        given = self.mechanism, self.run.known, self.formulation, self.accuracy, self.rank_nearby, self.interpolation
+        return evaluate_dense(*given, t)
 
     def _is_constraint(self, name):
         return isinstance(name, str) and name in self.mechanism.topology.constraints

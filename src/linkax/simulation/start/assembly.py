@@ -29,6 +29,7 @@ from linkax.simulation.start.validation import (
     coordinates_by_joint,
     sound_numbers,
 )
+from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import all_concrete, quick_compile
 
@@ -86,7 +87,7 @@ def assemble(
     for name, _ in begin.terms:
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
-    state, remainder = _assemble(mechanism, held, moving, begin, t)
+    state, remainder = _assemble(mechanism, KnownEntries.of(mechanism), held, moving, begin, t)
     if not all_concrete((state, remainder)):
         return State(state.q, jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf))
     remainder = jax.tree.map(np.asarray, remainder)
@@ -179,8 +180,8 @@ class _Remainder(eqx.Module):
 
 
 @quick_compile
-def _assemble(mechanism, positions, speeds, guess, t):
-    system = system_of(mechanism, jnp.result_type(float))
+def _assemble(mechanism, known, positions, speeds, guess, t):
+    system = system_of(mechanism, jnp.result_type(float), known=known)
     topology = system.topology
     q = jnp.asarray(neutral(topology, system.dtype))
     for given in (guess, positions):

@@ -19,6 +19,7 @@ from linkax.simulation.start.initial_state import ON_BRANCH
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.vectors import largest
+from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import materialise, positive_or_one, pushforward, ratio
 from linkax.xla.tracing import quick_compile
@@ -89,9 +90,13 @@ def _on_branch(asked, v):
     """Find speeds on a branch by Newton steps from a little beside v, which may lie just between two branches."""
     beside = BESIDE * jnp.sum(asked.split.inverse.basis, axis=1)
     off = asked.off_branch(v) > ON_BRANCH * rank_tolerance(v.dtype)
-    turn = lambda _, v: v + nearest_solution(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
     # As many each time: with a loop that ends sooner XLA (jaxlib 0.10) finds no callbacks in the rest of the program.
-    return lax.fori_loop(0, TURNS, turn, v + jnp.where(off, beside, 0.0))
+    return lax.fori_loop(0, TURNS, lambda _, v: _turn(asked, v), v + jnp.where(off, beside, 0.0))
+
+
+@straight_line
+def _turn(asked, v):
+    return v + nearest_solution(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
 
 
 @_on_branch.def_jvp
@@ -113,6 +118,7 @@ def _asked(configuration, held):
     return _Asked(split, rows, right / scale, scale)
 
 
+@straight_line
 def speeds_on_branch(
     configuration: Configuration, held: JointValues
 ) -> tuple[Float[Array, " n_v"], JointValues, Float[Array, ""], Bool[Array, ""]]:

@@ -17,6 +17,7 @@ from linkax.model.terms import Term
 from linkax.simulation.start.nearest_solution import elastic_energy, nearest_solution, nearest_solution_in, strains_of
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
+from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import pushforward, ratio
 from linkax.xla.static_scatter import scatter_static
@@ -60,6 +61,7 @@ class LoopClosure(eqx.Module):
         """All residuals: loop rows, flipped axes, misses."""
         return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(configuration)])
 
+    @straight_line
     def linearised(self, q: Float[Array, " n_q"]) -> tuple[Float[Array, " n"], Float[Array, "n n_v"]]:
         """The residuals and their derivative where the loops are closed; elsewhere the direction that closes them."""
         configuration, held = configure(self.system, self.t, q), ()
@@ -69,6 +71,18 @@ class LoopClosure(eqx.Module):
             held = jax.jacfwd(lambda change: self.misses(moved(change)))(still)
         close_loops = as_if_closed(configuration)
         return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], *held])
+
+    @straight_line
+    def size(self, q: Float[Array, " n_q"]) -> Float[Array, ""]:
+        """The size of all residuals."""
+        return _size(self.rows(configure(self.system, self.t, q)))
+
+    @straight_line
+    def newton(
+        self, rows: Float[Array, " n"], slopes: Float[Array, "n n_v"], back: Float[Array, " n_v"]
+    ) -> Float[Array, " n_v"]:
+        """The change nearest to `back` that closes the loops, where nothing is elastic."""
+        return nearest_solution(self.system, back, slopes, -rows)
 
     def back(self, q: Float[Array, " n_q"], guess: Float[Array, " n_q"]) -> Float[Array, " n_v"]:
         """The change that undoes the change of strains since a guess."""
@@ -114,7 +128,7 @@ class LoopClosure(eqx.Module):
 
         def newton(rows, slopes, back):
             if metrics is None:
-                return nearest_solution(self.system, back, slopes, -rows)[None]
+                return self.newton(rows, slopes, back)[None]
             return jax.vmap(lambda metric: nearest_solution_in(metric, self.system.scales, back, slopes, -rows))(
                 metrics
             )
@@ -137,7 +151,7 @@ class LoopClosure(eqx.Module):
             changes = (STEP_FRACTIONS[:, None, None] * steps).reshape(-1, steps.shape[1])
             tries = jax.vmap(lambda change: retract(self.system.topology, q, change))(changes)
             tries = jnp.concatenate([tries, q[None]])
-            sizes = jax.vmap(lambda q: _size(self.rows(configure(self.system, self.t, q))))(tries)
+            sizes = jax.vmap(self.size)(tries)
             misses = sizes + jax.vmap(strained)(tries)
             best = jnp.argmin(misses)
             return (tries[best], sizes[best]), misses[best]

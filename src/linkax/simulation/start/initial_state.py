@@ -16,6 +16,7 @@ from linkax.formulations.projected_state import ranks_along
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
+from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array, Scalar
 
 MOVES = 1e-6  # of the largest speed
@@ -69,36 +70,57 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
     method, system, t, given, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, state.q, q, v))
     # A singular mass matrix has spoiled them.
     q, v = jnp.where(jnp.all(jnp.isfinite(q)), q, given), jnp.where(jnp.isfinite(v), v, 0.0)
-    split, mass, acceleration, definiteness = method.at_rest(system, t, q)
+    found = _at_start(method, system, t, q, v)
     eps = jnp.finfo(system.dtype).eps
-    massive = definiteness > SINGULAR_ULPS * eps * len(v)
+    massive = found.definiteness > SINGULAR_ULPS * eps * len(v)
     assembled = jnp.logical_not(jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isposinf(state.v)) & (len(state.v) > 0))
-    finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & jnp.all(jnp.isfinite(mass))
-    finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, acceleration, 0.0)))
-    if system.topology.num_rows == 0:
-        true = jnp.ones((), bool)
-        sound = assembled, finite, massive, true, true, true
-        return InitialCheck(begins, start, jnp.zeros((), bool), split.inverse.rank, definiteness, *sound)
-    gap = gaps(split.configuration).in_scales(system)
-    small = jnp.sqrt(eps)
-    at_rest = system.fastest(v) ** 2 <= eps * system.fastest(acceleration)
-    direction = jnp.where(at_rest, acceleration, v)
-    off, rank = split.along(direction, at_rest)
-    # Rows that are not quite dependent contradict each other by as much.
-    on_branch = largest(off) <= ON_BRANCH * method.tolerance
+    finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & jnp.all(jnp.isfinite(found.mass))
+    finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, found.acceleration, 0.0)))
     return InitialCheck(
         t=begins,
         state=start,
-        singular=jnp.any(rank > split.inverse.rank),
-        rank=ranks_along(method, system, t, q, direction, rank),
-        definiteness=definiteness,
+        singular=jnp.any(found.rank > found.rank_here),
+        rank=found.rank
+        if system.topology.num_rows == 0
+        else ranks_along(method, system, t, q, found.direction, found.rank),
+        definiteness=found.definiteness,
         assembled=assembled,
         finite=finite,
         massive=massive,
-        closed=gap.widest() <= small,
-        on_branch=on_branch | at_rest,
-        unique=on_branch | jnp.logical_not(at_rest),
+        closed=found.gap <= jnp.sqrt(eps),
+        on_branch=found.on_branch | found.at_rest,
+        unique=found.on_branch | jnp.logical_not(found.at_rest),
     )
+
+
+class _AtStart(NamedTuple):
+    """What a check decides by: the acceleration from rest, the motion's direction, ranks of J here and along it."""
+
+    mass: Float[Array, "n_v n_v"]
+    acceleration: Float[Array, " n_v"]
+    definiteness: Float[Array, ""]
+    rank_here: Int[Array, " n_islands"]
+    rank: Int[Array, " n_islands"]
+    gap: Float[Array, ""]
+    direction: Float[Array, " n_v"]
+    at_rest: Bool[Array, ""]
+    on_branch: Bool[Array, ""]
+
+
+@straight_line
+def _at_start(method, system, t, q, v) -> _AtStart:
+    split, mass, acceleration, definiteness = method.at_rest(system, t, q)
+    rank = split.inverse.rank
+    if system.topology.num_rows == 0:
+        zero, false, true = jnp.zeros((), q.dtype), jnp.zeros((), bool), jnp.ones((), bool)
+        return _AtStart(mass, acceleration, definiteness, rank, rank, zero, v, false, true)
+    gap = gaps(split.configuration).in_scales(system).widest()
+    at_rest = system.fastest(v) ** 2 <= jnp.finfo(system.dtype).eps * system.fastest(acceleration)
+    direction = jnp.where(at_rest, acceleration, v)
+    off, beside = split.along(direction, at_rest)
+    # Rows that are not quite dependent contradict each other by as much.
+    on_branch = largest(off) <= ON_BRANCH * method.tolerance
+    return _AtStart(mass, acceleration, definiteness, rank, beside, gap, direction, at_rest, on_branch)
 
 
 def moving_joints(system: System, t: Scalar, q: Float[Array, " n_q"], directions: Float[Array, "n_v k"]) -> list[str]:
