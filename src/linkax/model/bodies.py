@@ -186,7 +186,7 @@ def inertia_tensor(inertia: Matrix, what: str) -> Float[Array, "3 3"]:
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)
     if diagonal:
         known = known_values(tensor)
-        tensor = like(tensor * np.eye(3), np.eye(3) * (1.0 if known is None else known))
+        tensor = like(tensor * np.eye(3), np.where(np.eye(3) == 1.0, 1.0 if known is None else known, 0.0))
     tensor = require(tensor, _is_symmetric, what, "it must be symmetric")
     moments = _principal_moments(tensor, diagonal)
     sizes = "" if concrete(moments) is None else f" {moments.tolist()}"
