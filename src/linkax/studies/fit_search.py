@@ -25,6 +25,7 @@ from linkax.xla.arrays import Array
 
 FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
 Mode = Literal["forward", "reverse"]
+Evaluation = tuple[Float[Array, " n"], Float[Array, "n p"]] | tuple[()]
 Step = tuple[Float[Array, " p"], Any, Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]
 
 
@@ -55,11 +56,15 @@ class AbstractSearch(eqx.Module):
         return ravel_pytree(self.function(self.free.params(z), *args))[0]
 
     @abc.abstractmethod
-    def begin(self, z: Float[Array, " p"], args: tuple) -> Any:
+    def evaluated(self, z: Float[Array, " p"], state: Any, args: tuple) -> Evaluation:
+        """What the next step needs that a program of its own computes; `state`: None before there is one."""
+
+    @abc.abstractmethod
+    def begin(self, z: Float[Array, " p"], found: Evaluation) -> Any:
         """The solver's state at z."""
 
     @abc.abstractmethod
-    def step(self, z: Float[Array, " p"], state: Any, args: tuple) -> Step:
+    def step(self, z: Float[Array, " p"], state: Any, args: tuple, found: Evaluation) -> Step:
         """The next z and state, a loss, whether its derivative is finite, and whether the search has converged.
 
         The loss is that at the next z for `Squares`, and at this z for `Descent`.
@@ -75,38 +80,41 @@ def sensitivity(
 
 
 class Squares(AbstractSearch):
-    """Steps of a least-squares solver of optimistix."""
+    """Steps of a least-squares solver of optimistix, by the residual and its Jacobian, which `sensitivity` computes."""
 
-    def _residual(self):
-        """The residual, with its Jacobian by forward mode as the reverse rule: the solver keeps an array from it."""
-        if self.mode == "reverse":
-            return lambda z, args: (self.flat(z, args), None)
+    def evaluated(self, z: Float[Array, " p"], state: Any, args: tuple) -> Evaluation:
+        return sensitivity(self, z if state is None else state.y_eval, args)
 
-        def residual(z, args):
-            flat = jax.custom_vjp(lambda z: self.flat(z, args))
-            flat.defvjp(lambda z: _linearised(lambda z: self.flat(z, args), z), lambda slopes, along: (along @ slopes,))
-            return flat(z), None
+    def begin(self, z: Float[Array, " p"], found: Evaluation) -> Any:
+        residual = cast(Any, found)[0]
+        shape = jax.ShapeDtypeStruct(residual.shape, residual.dtype)
+        return self.solver.init(_residual(*found), z, (), {"jac": "bwd"}, shape, None, frozenset())
 
-        return residual
-
-    def begin(self, z: Float[Array, " p"], args: tuple) -> Any:
-        shape = jax.eval_shape(self.flat, z, args)
-        return self.solver.init(self._residual(), z, args, {"jac": "bwd"}, shape, None, frozenset())
-
-    def step(self, z: Float[Array, " p"], state: Any, args: tuple) -> Step:
-        z, state, _ = self.solver.step(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
-        done, _ = self.solver.terminate(self._residual(), z, args, {"jac": "bwd"}, state, frozenset())
+    def step(self, z: Float[Array, " p"], state: Any, args: tuple, found: Evaluation) -> Step:
+        given = (), {"jac": "bwd"}, state, frozenset()
+        z, state, _ = self.solver.step(_residual(*found), z, *given)
+        done, _ = self.solver.terminate(_residual(*found), z, *given[:2], state, frozenset())
         smooth = jnp.all(jnp.isfinite(state.f_info.jac.as_matrix()))
         return z, state, 0.5 * jnp.sum(state.f_info.residual**2), smooth, done
+
+
+def _residual(value, slopes):
+    """A residual for the solver, known where it asks for it; with the Jacobian as a rule it keeps an array."""
+    known = jax.custom_vjp(lambda z: value)
+    known.defvjp(lambda z: (value, slopes), lambda slopes, along: (along @ slopes,))
+    return lambda z, args: (known(z), None)
 
 
 class Descent(AbstractSearch):
     """Steps of an optimiser of optax, which never tells that it has converged."""
 
-    def begin(self, z: Float[Array, " p"], args: tuple) -> Any:
+    def evaluated(self, z: Float[Array, " p"], state: Any, args: tuple) -> Evaluation:
+        return ()
+
+    def begin(self, z: Float[Array, " p"], found: Evaluation) -> Any:
         return self.solver.init(z)
 
-    def step(self, z: Float[Array, " p"], state: Any, args: tuple) -> Step:
+    def step(self, z: Float[Array, " p"], state: Any, args: tuple, found: Evaluation) -> Step:
         def loss(z):
             value = self.flat(z, args)
             return value[0] if self.is_loss else 0.5 * jnp.sum(value**2)
@@ -120,13 +128,13 @@ class Descent(AbstractSearch):
 
 
 @eqx.filter_jit
-def _begin(search, z, args):
-    return search.begin(z, args)
+def _begin(search, z, found):
+    return search.begin(z, found)
 
 
 @eqx.filter_jit
-def _step(search, z, state, args):
-    return search.step(z, state, args)
+def _step(search, z, state, args, found):
+    return search.step(z, state, args, found)
 
 
 def run_search(
@@ -146,18 +154,20 @@ def run_search(
     of another fit.
     """
     z = search.free.start
-    state = _begin(search, z, args)
+    found = search.evaluated(z, None, args)
+    state = _begin(search, z, found)
     losses, best, best_z, waited = [], np.inf, z, 0
-    kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, state, args)
+    kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, state, args, found)
     if kept is not None and kept.path.exists():
         (z, best_z, state), losses, waited = kept.load((z, best_z, state))
-        best = min(losses)
+        best, found = min(losses), None
     ended = None
     with progress_bar(steps, "step", progress, initial=len(losses)) as bar:
         while ended is None and len(losses) < steps + 1:
             before = z
-            z, state, loss, smooth, done = _step(search, z, state, args)
-            loss = float(loss)
+            found = search.evaluated(z, state, args) if found is None else found
+            z, state, loss, smooth, done = _step(search, z, state, args, found)
+            loss, found = float(loss), None
             if not losses:
                 _check_start(loss, smooth)
             losses.append(loss)
@@ -210,13 +220,19 @@ class _Checkpoint(NamedTuple):
 
     @staticmethod
     def of(
-        path: str | os.PathLike, search: AbstractSearch, z: Float[Array, " p"], state: Any, args: tuple
+        path: str | os.PathLike,
+        search: AbstractSearch,
+        z: Float[Array, " p"],
+        state: Any,
+        args: tuple,
+        found: Evaluation,
     ) -> "_Checkpoint":
         path = Path(require_type(path, str | os.PathLike, "checkpoint", "give the name of a file"))
         writable_folder(path.parent, f"give another checkpoint than {str(path)!r}")
         if path.is_dir():
             raise ValueError(f"checkpoint {str(path)!r} is a folder; give the name of a file")
-        text = cast(Any, _step).lower(search, z, state, args).as_text()
+        programs = [(_step, (search, z, state, args, found))] + [(sensitivity, (search, z, args))] * bool(found)
+        text = "".join(cast(Any, program).lower(*given).as_text() for program, given in programs)
         numbers = jax.tree.leaves(eqx.filter((search, z, args), eqx.is_array))
         return _Checkpoint(path, search.free.names, fingerprint(text, numbers))
 
