@@ -197,11 +197,18 @@ def close_loops(demand: LoopClosure, q: Float[Array, " n_q"]) -> Float[Array, " 
 @close_loops.def_jvp
 def _closed_jvp(primals, tangents):
     """Tangent by the implicit function theorem, nearest to that of where the search begins; the search has none."""
-    (demand, begin), (change, begins) = primals, tangents
-    q, topology = close_loops(demand, begin), demand.system.topology
+    demand, begin = primals
+    q = close_loops(demand, begin)
+    # Apart from their structure, see `linkax.formulations.projected_state`.
+    return q, _closed_tangent(demand, begin, q, *jax.tree.flatten(tangents))
+
+
+@straight_line
+def _closed_tangent(demand, begin, q, tangents, structure):
+    topology, (change, begins) = demand.system.topology, jax.tree.unflatten(structure, tangents)
     along = jnp.zeros_like(demand.system.scales) if begins is None else speeds(topology, begin, begins)
     at_rest = lambda demand: demand.rows(configure(demand.system, demand.t, q))
     rows, opens = pushforward(at_rest, (demand,), (change,))
     along = nearest_solution(demand.system, along, demand.linearised(q)[1], -opens)
     # Loops that do not close stay as open as they were found.
-    return q, rates(topology, q, jnp.where(_size(rows) <= CLOSED, along, 0.0))
+    return rates(topology, q, jnp.where(_size(rows) <= CLOSED, along, 0.0))
