@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cache, cached_property, partial, wraps
+from functools import cache, cached_property, lru_cache, partial, wraps
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -25,6 +25,7 @@ from linkax.xla.tracing import all_concrete, evaluate_now
 Output = TypeVar("Output")
 
 MOST_OPERATIONS = 30_000  # scalar ones, which take some seconds to compile
+KEPT = 16  # straight lines, of some megabytes each; others are made anew where they are compiled again
 LANES = 256  # that are computed together, in the cache of a processor
 BYTES_OF_A_LANE = 8 * 8  # of each argument and result, with copies
 
@@ -110,16 +111,12 @@ class Traced:
         self.tangent, self.transposed = cache(self._tangent), cache(self._transposed)
         self.compiled = cache(self._compiled)
 
-    @cached_property
+    @property
     def program(self) -> Program | None:
         """Its straight line; None where that is too long, or none of it is one."""
-        try:
-            program = straighten(self.jaxpr, self.known, self.most)
-        except TooLong:
-            return None
-        return program if program.graph.count or not program.between else None
+        return _program(self)
 
-    @property
+    @cached_property
     def is_straight(self) -> bool:
         return self.program is not None
 
@@ -164,6 +161,15 @@ class Traced:
     def _compiled(self, lanes, batched):
         """A program of its own, for calls outside of others; kept with this object, and no longer."""
         return jax.jit(partial(_straight.bind, traced=self, lanes=lanes, batched=batched))
+
+
+@lru_cache(maxsize=KEPT)
+def _program(traced: Traced) -> Program | None:
+    try:
+        program = straighten(traced.jaxpr, traced.known, traced.most)
+    except TooLong:
+        return None
+    return program if program.graph.count or not program.between else None
 
 
 def _no_tangent(primal):
