@@ -28,15 +28,13 @@ class Kernel:
     `checked`: scalars that spoil all results where they are not finite.
     """
 
-    def __init__(
-        self, graph: Graph, given: Container[int], results: Sequence[int], checked: Container[int] = ()
-    ) -> None:
+    def __init__(self, graph: Graph, given: Container[int], results: Sequence[int], checked: Container[int]) -> None:
         self.graph, self.results, self.checked = graph, list(results), checked
         self.order = graph.needed(self.results, given)
-        self.given = [index for index in self.order if index in given]
+        arguments = [index for index in self.order if index in given]
         # Arguments of one type come in one array, with a row of zeros: XLA can tell that it overlaps with no result.
-        self.types = list(dict.fromkeys(graph.dtypes[index] for index in self.given))
-        self.columns = [[index for index in self.given if graph.dtypes[index] == dtype] for dtype in self.types]
+        self.types = list(dict.fromkeys(graph.dtypes[index] for index in arguments))
+        self.columns = [[index for index in arguments if graph.dtypes[index] == dtype] for dtype in self.types]
 
     def __call__(self, scalars: dict[int, jax.Array], lanes: tuple[int, ...]) -> list[jax.Array]:
         """Compute the results, (lanes) each, from the scalars that are given."""
@@ -66,7 +64,7 @@ class Kernel:
 
 
 def _abstract(spoils, *columns, kernel: Kernel, lanes: int):
-    return [ShapedArray((lanes,), kernel.graph.dtypes[index]) for index in kernel.results]
+    return [_aval(kernel.graph, index, lanes) for index in kernel.results]
 
 
 def _lower(context, spoils, *columns, kernel: Kernel, lanes: int):
