@@ -156,9 +156,9 @@ COMPARED = ["compare", "pendulum", "--t1", "2"]
         (PENDULUM, "", 2.0, set()),
         (PENDULUM, "assembling", 0.0, set()),
         (PENDULUM, "compiling", 0.5, set()),
-        (["simulate", "crank-slider"], "compiling", 3.0, set()),
+        (["simulate", "n-four-bar", "--set", "N=6"], "compiling", 1.0, set()),  # which compiles for seconds anywhere
         (["simulate", "pendulum", "--t1", "1e5"], "integrating", 1.0, set()),
-        (PENDULUM, "reading", 0.5, {"trajectory-interrupted.npz", "summary-interrupted.json"}),
+        (PENDULUM, "reading", 0.1, {"trajectory-interrupted.npz", "summary-interrupted.json"}),
         (PENDULUM, "drawing", 0.0, {"trajectory.npz", "summary.json"}),
         (PENDULUM, "drawing", 2.0, {"trajectory.npz", "summary.json"}),
         (PENDULUM, "drawing", 3.0, {"trajectory.npz", "summary.json"}),
