@@ -1,9 +1,9 @@
 """What a first run waits for: tracing and compiling, BALANCED unless named.
 
-first-runs: `linkax.simulate` over 10 s, by how much the first of equal runs takes longer than the others, with and
-without `optimise`. programs: compiled as one each, simulations and their gradients: the crank-slider SC1 over 10 s;
-Bricard's mechanism over 1 s; and a row of four four-bars over 1 s with twenty parameters: masses and inertias of nine
-bodies, gravity, angle at the start.
+first-runs: `linkax.simulate` over 10 s, by how much the first of equal runs takes longer than the others. programs:
+compiled as one each, simulations and their gradients: the crank-slider SC1 over 10 s; Bricard's mechanism over 1 s; and
+a row of four four-bars over 1 s with twenty parameters: masses and inertias of nine bodies, gravity, angle at the
+start.
 """
 
 import time
@@ -80,18 +80,14 @@ def least(run):
 
 def first_runs():
     for name, changes in FIRST_RUNS:
-        for optimise in (True, False):
-            jax.clear_caches()
-            scene = SCENES[name]
-            settings = scene.settings(None, changes)
-            mechanism = scene.mechanism(settings)
-            state = scene.initial(mechanism, settings)
-            run = lambda mechanism=mechanism, state=state, optimise=optimise: lx.simulate(
-                mechanism, state, t1=10.0, optimise=optimise
-            )
-            first, again = seconds_of(run), least(run)
-            asked = {"scene": name, **changes, "optimise": optimise}
-            yield asked | {"compile_s": round(first - again, 2), "run_ms": milliseconds(again)}
+        jax.clear_caches()
+        scene = SCENES[name]
+        settings = scene.settings(None, changes)
+        mechanism = scene.mechanism(settings)
+        state = scene.initial(mechanism, settings)
+        run = lambda mechanism=mechanism, state=state: lx.simulate(mechanism, state, t1=10.0)
+        first, again = seconds_of(run), least(run)
+        yield {"scene": name, **changes, "compile_s": round(first - again, 2), "run_ms": milliseconds(again)}
 
 
 def programs():

@@ -10,7 +10,7 @@ from PIL import Image
 from linkax.cli import main, options
 
 KEYS = {
-    "scene", "variant", "t1", "preset", "steps", "compile_s", "run_s", "optimised", "position_violation",
+    "scene", "variant", "t1", "preset", "steps", "compile_s", "run_s", "position_violation",
     "velocity_violation", "acceleration_violation", "energy_error", "rank_min", "rank_max", "result", "final",
     "singularity_distance", "passages", "digits_lost",
 }  # fmt: skip

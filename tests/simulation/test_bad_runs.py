@@ -65,7 +65,7 @@ OPTIONS = {
         diffrax.PIDController(rtol=jnp.asarray(np.inf), atol=1e-8), diffrax.PIDController(rtol=1e308, atol=1e-8),
     ],
     "max_steps": [0, -5, 1.5, "many", True, np.nan, 10**400],
-    "optimise": ["no", None, 1.0, jnp.ones(3)],
+    "optimise": ["no", 1.0, jnp.ones(3)],
     "throw": ["no", None, 1.0, jnp.ones(3)],
     "adjoint": ["reverse", 3, diffrax.ForwardMode, diffrax.BacksolveAdjoint()],
     "event": [3, lambda t, state, mechanism: t > 1.0, diffrax.Event],

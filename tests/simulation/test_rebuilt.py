@@ -38,7 +38,7 @@ def turned(numbers):
     event = diffrax.Event(lambda t, state, mechanism: state.q[0] - 100.0 * torque)
     saveat = diffrax.SaveAt(t1=True, fn=lambda t, state, mechanism: state.q[0])
     start = lx.State(jnp.zeros(1), jnp.zeros(1))
-    found = lx.simulate(mechanism, start, t1=1.0, saveat=saveat, event=event, optimise=False)
+    found = lx.simulate(mechanism, start, t1=1.0, saveat=saveat, event=event)
     return found.ys[-1]
 
 

@@ -58,18 +58,20 @@ def test_poses_are_those_of_each_body():
         np.testing.assert_allclose(pose.axes, found.orientation(name), atol=1e-15)
 
 
-@pytest.mark.parametrize(("worth", "optimised"), [(np.inf, False), (0.0, True)])
-def test_a_run_in_segments_is_the_run(monkeypatch, worth, optimised):
+def test_optimise_is_deprecated():
+    mechanism = pendulum()
+    with pytest.warns(DeprecationWarning, match="optimise has no effect any more; leave it out"):
+        lx.simulate(mechanism, lx.assemble(mechanism, {"pivot": 0.3}), t1=2.0, optimise=False)
+
+
+def test_a_run_in_segments_is_the_run(monkeypatch):
     monkeypatch.setattr(progress_run, "LONG_RUN", 0.0)
-    monkeypatch.setattr(progress_run, "WORTH_OPTIMISING", worth)
     told, kept, mechanism = [], [], pendulum()
     state = lx.assemble(mechanism, {"pivot": 0.3})
     options = {"t1": 2.0, "accuracy": lx.PRECISE}
     found = progress_run.simulate_in_segments(
         mechanism, state, **options, report=lambda *now: told.append(now), keep=kept.append
     )
-    assert found.optimised == optimised
-    assert (("optimising", None) in told) == optimised
     assert told[-1] == ("integrating", pytest.approx(0.95))
     whole = lx.simulate(mechanism, state, saveat=diffrax.SaveAt(ts=found.solution.ts), **options)
     np.testing.assert_allclose(found.solution.ts, np.linspace(0.0, 2.0, 1001), rtol=1e-15)

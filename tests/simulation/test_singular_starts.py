@@ -260,7 +260,7 @@ def test_many_starts_of_rows_of_loops_with_all_links_in_line(count, starts):
         mechanism = scene.mechanism(settings)
         state = scene.initial(mechanism, settings)
         saveat = diffrax.SaveAt(ts=times)
-        found = lx.simulate(mechanism, state, t1=0.5, accuracy=lx.Accuracy(rtol=rtol), saveat=saveat, optimise=False)
+        found = lx.simulate(mechanism, state, t1=0.5, accuracy=lx.Accuracy(rtol=rtol), saveat=saveat)
         expected = scene.exact(settings, times)["B0"]
         np.testing.assert_allclose(found.position("link_0", "tip"), expected, atol=100.0 * rtol, err_msg=str(asked))
 

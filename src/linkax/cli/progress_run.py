@@ -26,21 +26,15 @@ from linkax.simulation.start.state import State
 SEGMENTS = 20
 DEFAULT_INTERVALS = 1000
 LONG_RUN = 2.0  # a run that would take longer is cut into segments [s]
-WORTH_OPTIMISING = 4.0  # run time, relative to compile time, above which the program is optimised
 INSTANT = 1e-6  # duration of the run that compiles, relative to the whole
 
 
 class TimedRun(NamedTuple):
-    """A solution, and how long it took.
-
-    - `compile_s`, `run_s`: wall time of compiling and of running [s].
-    - `optimised`: whether the program was optimised, see `linkax.simulate`; with beams it always is.
-    """
+    """A solution, and how long it took: wall time of compiling and of running [s]."""
 
     solution: Solution
     compile_s: float
     run_s: float
-    optimised: bool
 
 
 def simulate_in_segments(
@@ -59,7 +53,7 @@ def simulate_in_segments(
     """Integrate from 0 to t1 [s], and report the progress.
 
     A long run is cut into segments, each of which takes a few steps more than the same part of an uncut run. The first
-    segment shows whether that is worth it, and whether the program, which all segments share, is worth optimising.
+    segment shows whether that is worth it; all share a program.
 
     **Arguments:**
 
@@ -76,25 +70,19 @@ def simulate_in_segments(
     options = dict(accuracy=accuracy, solver=solver, formulation=formulation, **fixed_steps(step, t1))
     run = partial(_timed, mechanism, intervals, options)
     report("compiling", None)
-    optimised = bool(mechanism.beams)
-    _, compile_s = run(state, 0.0, INSTANT * t1, optimised)
+    _, compile_s = run(state, 0.0, INSTANT * t1)
     report("integrating", 0.0)
-    first, run_s = run(state, 0.0, t1 / SEGMENTS, optimised)
-    if not optimised and SEGMENTS * run_s > WORTH_OPTIMISING * compile_s:
-        report("optimising", None)
-        optimised, (_, seconds) = True, run(state, 0.0, INSTANT * t1, True)
-        compile_s += seconds
-        report("integrating", 1.0 / SEGMENTS)
+    first, run_s = run(state, 0.0, t1 / SEGMENTS)
     # A classical formulation keeps the gaps that it has left; a segment would begin with closed loops.
     if isinstance(first.formulation, TangentSpace) and _is_long(first, run_s):
-        whole, seconds = _with_later_segments(run, first, t1, optimised, report, keep)
-        return TimedRun(whole, compile_s, run_s + seconds, optimised)
-    whole, run_s = run(state, 0.0, t1, optimised, intervals)
+        whole, seconds = _with_later_segments(run, first, t1, report, keep)
+        return TimedRun(whole, compile_s, run_s + seconds)
+    whole, run_s = run(state, 0.0, t1, intervals)
     keep(whole)
-    return TimedRun(whole, compile_s, run_s, optimised)
+    return TimedRun(whole, compile_s, run_s)
 
 
-def _timed(mechanism, intervals, options, start, t0, end, optimise, count=None) -> tuple[Solution, float]:
+def _timed(mechanism, intervals, options, start, t0, end, count=None) -> tuple[Solution, float]:
     """A part of the run, saved after `count` intervals, by default those of a segment, and its wall time [s].
 
     All parts have equally many saved times, and so share a program.
@@ -103,11 +91,11 @@ def _timed(mechanism, intervals, options, start, t0, end, optimise, count=None) 
     began = time.perf_counter()
     times = np.pad(np.linspace(t0, end, count + 1), (0, intervals - count), mode="edge")
     saveat = diffrax.SaveAt(ts=jnp.asarray(times))
-    solution = simulate(mechanism, start, t0=t0, t1=end, saveat=saveat, optimise=optimise, throw=False, **options)
+    solution = simulate(mechanism, start, t0=t0, t1=end, saveat=saveat, throw=False, **options)
     return jax.block_until_ready(solution), time.perf_counter() - began
 
 
-def _with_later_segments(run, first, t1, optimised, report, keep) -> tuple[Solution, float]:
+def _with_later_segments(run, first, t1, report, keep) -> tuple[Solution, float]:
     """The solution of all segments, from that of the first, and the wall time of the later ones [s]."""
     parts, whole, total = [first], _joined([first]), 0.0
     keep(whole)
@@ -115,7 +103,7 @@ def _with_later_segments(run, first, t1, optimised, report, keep) -> tuple[Solut
         if whole.result != RESULTS.successful:
             break
         report("integrating", float(t0 / t1))
-        part, seconds = run(whole.end, t0, end, optimised)
+        part, seconds = run(whole.end, t0, end)
         parts, total = [*parts, part], total + seconds
         whole = _joined(parts)
         keep(whole)

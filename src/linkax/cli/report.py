@@ -38,7 +38,6 @@ def summary(run: TimedRun, points: Points) -> dict[str, Any]:
         "rejected_steps": int(solution.stats["num_rejected_steps"]),
         "compile_s": run.compile_s,
         "run_s": run.run_s,
-        "optimised": run.optimised,
         "position_violation": finite(violation.position),
         "velocity_violation": finite(violation.velocity),
         "acceleration_violation": finite(violation.acceleration),

@@ -36,7 +36,7 @@ def simulate(
     event: diffrax.Event | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     dtype: Any = None,
-    optimise: bool = True,
+    optimise: bool | None = None,
     throw: bool = True,
 ) -> Solution:
     """Integrate the motion of a mechanism from a state at t0 to t1 [s].
@@ -65,8 +65,7 @@ def simulate(
       it ends with the step in which the event occurs: derivatives of its end are not a number.
     - `dtype`: floating-point type of the whole computation, default double precision.
     - `dt0`, `max_steps`, `progress_meter`: as in diffrax.
-    - `optimise`: False compiles in less than half of the time a program that takes three to eight times as long:
-      for a run to be made once. It does nothing for mechanisms with beams, nor inside JAX transformations.
+    - `optimise`: deprecated, and without effect: every run compiles as quickly as those without it did.
     - `throw`: raise where the run fails. Inside JAX transformations nothing is raised, and
       `solution.result` alone tells.
 
@@ -81,6 +80,9 @@ def simulate(
     them `solution.remark()` says so, see `linkax.REMARKS`.
     """
     require_bool(throw, "throw")
+    if optimise is not None:
+        require_bool(optimise, "optimise")
+        warnings.warn("optimise has no effect any more; leave it out", DeprecationWarning, stacklevel=2)
     run = Run.of(
         mechanism,
         state,
@@ -89,7 +91,6 @@ def simulate(
         accuracy=accuracy,
         formulation=formulation,
         dtype=dtype,
-        optimise=optimise,
         saveat=saveat,
         solver=solver,
         stepsize_controller=stepsize_controller,

@@ -28,7 +28,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
 from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program, concrete, quick_compile
+from linkax.xla.tracing import concrete, jit_inline, quick_compile
 from linkax.xla.undefined import undefined_where
 
 
@@ -46,11 +46,11 @@ def integrate_run(run: Run) -> Outcome:
     initial = _check_start(run.mechanism, run.known, run.state, run.t0, run.tangent_space)
     if concrete(sound := sound_numbers(run.mechanism)) is None:
         initial = initial.of_numbers(sound)
-    integrated = _integrate.choose(run.quick, run, initial)(run, initial)
+    integrated = _integrate(run, initial)
     saveat: Any = run.options.saveat
     given = (integrated.ts, integrated.t_end), (integrated.ys, integrated.y_end), saves_states(saveat), _firsts(run)
-    given = run.mechanism, run.known, run.formulation, run.accuracy, initial, *given
-    return Outcome(initial, integrated, *_closed.choose(run.quick, *given)(*given))
+    closed = _closed(run.mechanism, run.known, run.formulation, run.accuracy, initial, *given)
+    return Outcome(initial, integrated, *closed)
 
 
 @quick_compile
@@ -74,7 +74,7 @@ def problem_of(
     )
 
 
-@Program
+@jit_inline
 def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     dtype = initial.state.q.dtype
     formulation, t0, t1, options, control = cast((run.formulation, run.t0, run.t1, run.options, run.control), dtype)
@@ -184,7 +184,7 @@ def _firsts(run):
     return None if ts is None else np.searchsorted(ts, ts)
 
 
-@Program
+@jit_inline
 def _closed(
     mechanism, known, formulation, accuracy, initial, times, values, saves, firsts
 ) -> tuple[State, State | None]:

@@ -15,7 +15,7 @@ from linkax.formulations.named import formulation as named_formulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.functions import Function
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import Number, require_bool, require_type
+from linkax.model.numbers import Number, require_type
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.discrete_adjoint import has_discrete_adjoint
@@ -71,7 +71,6 @@ class Run(eqx.Module):
     """One run of a mechanism from a state at t0 to t1 [s], as `linkax.simulate` was asked for it.
 
     - `formulation`: of the equations of motion. `accuracy`: tolerances and projection.
-    - `optimise`: see `linkax.simulate`.
     - `saves_times`: whether states are saved at given times, and nothing else.
     - `known`: which entries of the mechanism's arrays its programs may know.
     """
@@ -82,7 +81,6 @@ class Run(eqx.Module):
     t1: Float[Array, "*batch"] | float | np.floating
     formulation: AbstractFormulation
     accuracy: Accuracy
-    optimise: bool = eqx.field(static=True)
     saves_times: bool = eqx.field(static=True)
     known: KnownEntries = eqx.field(static=True)
     _options: DiffraxOptions | _Frozen | None
@@ -97,7 +95,6 @@ class Run(eqx.Module):
         accuracy: Accuracy,
         formulation: str | AbstractFormulation | None,
         dtype: Any,
-        optimise: bool,
         **given: Any,
     ) -> "Run":
         """Check all options of `linkax.simulate`, and fill in those that are None.
@@ -109,14 +106,13 @@ class Run(eqx.Module):
             raise ValueError(f"t1 is {t1} s, t0 is {t0} s; t1 must be larger")
         state = checked_state(mechanism, state)
         check_accuracy(accuracy)
-        require_bool(optimise, "optimise")
         check_kinds(**{name: entry for name, entry in given.items() if name not in ("dt0", "max_steps")})
         formulation = checked_formulation(formulation, accuracy)
         options = _filled_in(mechanism, accuracy, t0, t1, **given)
         known = KnownEntries.of(mechanism)
         mechanism, state, t0, accuracy = cast((mechanism, state, t0, accuracy), dtype)
         saves = saves_times(options.saveat)
-        return Run(mechanism, state, t0, t1, formulation, accuracy, optimise, saves, known, options)
+        return Run(mechanism, state, t0, t1, formulation, accuracy, saves, known, options)
 
     @staticmethod
     def of_state(
@@ -124,7 +120,7 @@ class Run(eqx.Module):
     ) -> "Run":
         """What a state alone says of a run: nothing is stepped."""
         known = KnownEntries.of(mechanism)
-        return Run(mechanism, state, t, t, formulation, accuracy, True, False, known, None)
+        return Run(mechanism, state, t, t, formulation, accuracy, False, known, None)
 
     @property
     def is_integrated(self) -> bool:
@@ -156,11 +152,6 @@ class Run(eqx.Module):
         if self.options.adjoint is not None:
             return self.options.adjoint
         return diffrax.ForwardMode() if self.has_discrete_adjoint else diffrax.RecursiveCheckpointAdjoint()
-
-    @property
-    def quick(self) -> bool:
-        """Whether to compile a program for one run: large arrays, as of beams, take as long to compile either way."""
-        return not self.optimise and not self.mechanism.beams
 
     @property
     def tangent_space(self) -> TangentSpace:
