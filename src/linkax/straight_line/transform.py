@@ -26,8 +26,9 @@ Output = TypeVar("Output")
 
 MOST_OPERATIONS = 30_000  # scalar ones, which take some seconds to compile
 KEPT = 16  # straight lines, of some megabytes each; others are made anew where they are compiled again
-LANES = 256  # that are computed together, in the cache of a processor
-BYTES_OF_A_LANE = 8 * 8  # of each argument and result, with copies
+LANES = 64  # that are computed together, in the nearest cache of a processor
+MANY_ENTRIES = 500  # of an array that is made of its distinct scalars
+BYTES_OF_A_LANE = 2 * 8  # of each argument and result; XLA counts up to 8
 
 
 def straight_line(function: Callable[..., Output], most: int = MOST_OPERATIONS) -> Callable[..., Output]:
@@ -218,13 +219,17 @@ def _in_kernels(*operands, traced: Traced, lanes: int | None, batched: tuple[boo
             scalars.update(zip(wanted, kernel(scalars, shape), strict=True))
 
     def dense(entries, aval):
-        known = lambda index: jnp.asarray(graph.values[index], aval.dtype)
-        flat = [scalars[index] if graph.values[index] is None else known(index) for index in entries.ravel().tolist()]
-        flat = [jnp.broadcast_to(scalar, shape) for scalar in flat]
-        if not flat:
+        if not entries.size:
             return jnp.zeros((*shape, *entries.shape), aval.dtype)
-        stacked = jnp.stack(flat).reshape(*entries.shape, *shape)
-        return stacked if lanes is None else jnp.moveaxis(stacked, -1, 0)
+        known = lambda index: jnp.asarray(graph.values[index], aval.dtype)
+        parts, places = np.unique(entries, return_inverse=True)
+        # XLA takes long to compile an array of many parts; most entries of a large one are the same zero.
+        repeats = entries.size > MANY_ENTRIES
+        flat = parts if repeats else entries.ravel()
+        flat = [scalars[index] if graph.values[index] is None else known(index) for index in flat.tolist()]
+        stacked = jnp.stack([jnp.broadcast_to(scalar, shape) for scalar in flat])
+        stacked = stacked[places] if repeats else stacked
+        return jnp.moveaxis(stacked.reshape(*entries.shape, *shape), range(entries.ndim), range(-entries.ndim, 0))
 
     for entries, array, is_batched in zip(program.inputs, operands, batched, strict=True):
         keep(entries, array, is_batched)

@@ -20,8 +20,6 @@ used. What would have to be found another way:
 - `jax.core.Tracer` (`tracing`): whether numbers of a model are known, and can be checked.
 - `jax.core.eval_context` (`tracing`): known numbers inside a transformation, computed without being part of it.
 - `jax.core.ShapedArray` (`cross_product`, `undefined`): shapes of what a primitive returns.
-- `jax.extend.core` Jaxpr, `dot_general_p` (`products_as_sums`): small products as sums, without which they call a
-  library at half of the speed.
 - `jax.extend.core.Primitive`, `jax.interpreters` `ad`, `batching`, `mlir` (`cross_product`): derivatives of vector
   products, in a fraction of the operations.
 - `jax.extend.core` Jaxpr and Literal, names and parameters of JAX's primitives (`straight_line.program`,
@@ -31,7 +29,7 @@ used. What would have to be found another way:
   (`straight_line.kernel`; jaxlib 0.10, known up to 0.12), which is tried. Without it: runs take several times as long;
   a warning says so. Outside of such a loop, or with constants or arguments as results, a fusion ends the process.
 - `jax.custom_derivatives.SymbolicZero` (`derivatives`): which arguments have no tangent.
-- `jax.custom_batching.custom_vmap`, `jax.lax.platform_dependent` (`one_kernel`, `batches`): batches faster than their
+- `jax.custom_batching.custom_vmap`, `jax.lax.platform_dependent` (`batches`): batches faster than their
   members one by one, and without LAPACK that waits for ever (`one_by_one`).
 - `jax.monitoring`, the event before XLA compiles, and `clear_caches` of JAX and Equinox (`memory_maps`): room for
   compiled programs, without which XLA ends a process that has compiled too many.

@@ -2,10 +2,11 @@
 
 XLA makes a kernel of each operation that it cannot fuse with others. On a CPU it takes some 50 ns to start one, longer
 than it runs, where a mechanism is small. A loop over few numbers becomes one kernel, unless it calls a library, as for
-products of matrices (see `linkax.xla.products_as_sums`). A flag says how many are few. XLA reads it once in a process,
-when JAX makes its first array, and ends the process for a flag that it does not know; so this one is an extra option,
-in a list that XLA does not check. A second flag leaves fewer products to a library in batches; only versions that are
-known to know it get it. Versions tell too little of what XLA does, so it is tried.
+products of matrices. A flag says how many are few: with more than a million bytes XLA takes twice as long to compile,
+for no gain. XLA reads it once in a process, when JAX makes its first array, and ends the process for a flag that it
+does not know; so this one is an extra option, in a list that XLA does not check. A second flag leaves fewer products to
+a library in batches; only versions that are known to know it get it. Versions tell too little of what XLA does, so it
+is tried.
 
 Most of the time to compile goes into optimisations, which a program that runs once does not earn back.
 """
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxlib import version as jaxlib
 
-WHOLE_LOOP_BYTES = 2**22  # read and written by one pass of a loop
+WHOLE_LOOP_BYTES = 2**20  # read and written by one pass of a loop
 LOOP_BYTES = "xla_cpu_small_while_loop_byte_threshold"
 LOOPS = f"--xla_backend_extra_options={LOOP_BYTES}={WHOLE_LOOP_BYTES}"
 PRODUCTS = "--xla_cpu_experimental_ynn_fusion_type="
@@ -56,7 +57,7 @@ def _is_known(options) -> bool:
 
 @cache
 def makes_kernels_of_loops() -> bool:
-    """Whether XLA makes one kernel of a loop like those of `linkax.xla.one_kernel.in_one_kernel`.
+    """Whether XLA makes one kernel of a loop over few numbers, as straight lines need.
 
     It does not where JAX had made an array before linkax was imported, where `XLA_FLAGS` say otherwise, and in versions
     without such kernels. Warns where runs on a CPU are slow for that, unless `XLA_FLAGS` ask for it.

@@ -19,7 +19,6 @@ from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.integrate.switches import Sides, crossed, meet
 from linkax.xla.arrays import Array
-from linkax.xla.one_kernel import in_one_kernel
 
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
 STAGNATES = 0.9  # rate at which they no longer fall
@@ -88,8 +87,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
     in the state. The rest is mostly rounding, which a singular configuration amplifies and the
     correction removes; a step control that saw it would stall.
 
-    - `after_step`: whether to correct. `is_undifferentiated`: no transformation will differentiate its steps, so that
-      each may be one kernel.
+    - `after_step`: whether to correct. `is_undifferentiated`: no transformation will differentiate its steps.
 
     Not an `AbstractWrappedSolver`: diffrax would look through it for fields it does not have.
     """
@@ -153,10 +151,6 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
     def func(self, terms: Any, t0: Float[Array, ""], y0: Float[Array, " n"], args: Problem) -> Float[Array, " n"]:
         return self.solver.func(terms, t0, y0, args)
 
-    @in_one_kernel(
-        when=lambda self, *_: self.is_undifferentiated,
-        sound=lambda self, terms, t0, t1, y0, *_: jnp.all(jnp.isfinite(y0)),
-    )
     def step(
         self,
         terms: Any,

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from linkax.simulation.integrate.diffrax_contract import StepError
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.one_kernel import in_one_kernel
 
 NOISE_ULPS = 1.0
 SEEN_ULPS = 512.0  # of estimates: rounding changes larger ones by less than a hundredth
@@ -87,7 +86,6 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         first, state = self.controller.init(terms, t0, t1, (v, v), dt0, args, func, error_order)
         return first, (state, jnp.zeros((), int))
 
-    @in_one_kernel(when=lambda self, *_: self.is_undifferentiated, sound=lambda self, t0, *_: jnp.isfinite(t0))
     def adapt_step_size(
         self,
         t0: Float[Array, ""],

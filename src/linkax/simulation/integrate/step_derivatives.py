@@ -19,7 +19,6 @@ from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.projected_solver import ProjectedSolver
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise
-from linkax.xla.products_as_sums import with_products_as_sums
 
 
 class InitialValueProblem(NamedTuple):
@@ -163,7 +162,7 @@ def tangents_over_steps(
         steps=jnp.zeros_like(steps.ys).at[0].set(materialise(y0, tangents.y0)) if every else None,
     )
     begin = jnp.zeros((), int), jnp.zeros((), int), y0, motion
-    return lax.while_loop(lambda carry: carry[0] < count, with_products_as_sums(one), begin)[-1]
+    return lax.while_loop(lambda carry: carry[0] < count, one, begin)[-1]
 
 
 def _reached(saved, j, t):
@@ -205,9 +204,7 @@ def cotangents_over_steps(
     count = 0 if saved is None else jnp.sum(saved <= finish)
     saved_bar = None if saved is None else jnp.zeros_like(saved)
     begin = last, count - 1, cotangent.end, jax.tree.map(jnp.zeros_like, problem), zero, zero, saved_bar
-    *_, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(
-        lambda carry: carry[0] >= 0, with_products_as_sums(one), begin
-    )
+    *_, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(lambda carry: carry[0] >= 0, one, begin)
     return eqx.filter(InitialValueProblem(problem_bar, y_bar, t0_bar, t1_bar, saved_bar), wanted)
 
 
