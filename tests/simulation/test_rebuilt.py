@@ -1,26 +1,13 @@
 """Mechanisms built again and again, with functions in them that are made anew each time."""
 
-from contextlib import contextmanager
-
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 
 import linkax as lx
-from linkax.xla.memory_maps import COMPILING
-
-
-@contextmanager
-def compilations():
-    """How many programs XLA compiles meanwhile."""
-    names = []
-    note = lambda event, _, **what: names.append(what) if event == COMPILING else None
-    jax.monitoring.register_event_duration_secs_listener(note)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(note)
-
 
 HINGE = ("hinge", lx.GROUND)
 

@@ -5,6 +5,7 @@ Zhao, Qi, Wang, Xu, Applied Mathematics and Mechanics 47(8), 2026, doi 10.21656/
 
 import math
 
+import jax
 import jax.numpy as jnp
 
 import linkax as lx
@@ -41,6 +42,7 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     )
 
 
+@jax.jit
 def _rod(crank: Number, rod: Number, angle: Number, speed: Number) -> tuple[Scalar, Scalar, Scalar]:
     """Compute the rod's angle from +x [rad], its rate [rad/s], and the slider's distance [m].
 

@@ -28,7 +28,8 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
 from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import concrete, jit_inline, quick_compile
+from linkax.xla.side_by_side import side_by_side
+from linkax.xla.tracing import Program, all_concrete, concrete, jit_inline
 from linkax.xla.undefined import undefined_where
 
 
@@ -43,17 +44,25 @@ class Outcome(NamedTuple):
 
 def integrate_run(run: Run) -> Outcome:
     """Integrate a run, in three programs: another solver, formulation or saveat compiles no more than it must."""
-    initial = _check_start(run.mechanism, run.known, run.state, run.t0, run.tangent_space)
+    given, traces = (run.mechanism, run.known, run.state, run.t0, run.tangent_space), _check_start.traces
+    initial = _check_start(*given)
     if concrete(sound := sound_numbers(run.mechanism)) is None:
         initial = initial.of_numbers(sound)
+    if _check_start.traces > traces and all_concrete((run, initial)):
+        with side_by_side() as compiled:
+            compiled(_closed, *_closing(run, initial, compiled(_integrate, run, initial)))
     integrated = _integrate(run, initial)
+    return Outcome(initial, integrated, *_closed(*_closing(run, initial, integrated)))
+
+
+def _closing(run, initial, integrated):
+    """The arguments of `_closed`."""
     saveat: Any = run.options.saveat
     given = (integrated.ts, integrated.t_end), (integrated.ys, integrated.y_end), saves_states(saveat), _firsts(run)
-    closed = _closed(run.mechanism, run.known, run.formulation, run.accuracy, initial, *given)
-    return Outcome(initial, integrated, *closed)
+    return run.mechanism, run.known, run.formulation, run.accuracy, initial, *given
 
 
-@quick_compile
+@Program
 def _check_start(mechanism, known, state, t0, tangent_space) -> InitialCheck:
     dtype = state.q.dtype
     return check_initial_state(tangent_space.prepared(dtype), system_of(mechanism, dtype, known=known), t0, state)

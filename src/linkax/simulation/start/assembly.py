@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, on_manifold
@@ -156,21 +156,19 @@ def _raise_if_open(mechanism, state, t, remainder):
 
 
 class _Remainder(eqx.Module):
-    """What stays open, for the error message; of each beam the largest change of a strain, and its energy."""
+    """What stays open, for the error message; of each beam the largest change of a strain, and its energy.
+
+    - `most`: the largest miss of coordinates and speeds that counts as none.
+    """
 
     gap: Gap
     gap_in_scales: Gap
-    length: Array
+    most: Array
     positions: JointValues
     speeds: JointValues
     off_branch: Array
     undecided: Array
     strained: dict
-
-    @property
-    def most(self) -> Float[Array, ""]:
-        """The largest miss of coordinates and speeds that counts as none."""
-        return CLOSED * jnp.maximum(self.length, 1.0)
 
     def is_met(self) -> Bool[Array, ""]:
         """Whether the loops are closed and all that is held is met."""
@@ -198,7 +196,7 @@ def _assemble(mechanism, known, positions, speeds, guess, t):
     remainder = _Remainder(
         gap=gap,
         gap_in_scales=gap.in_scales(system),
-        length=system.length,
+        most=CLOSED * jnp.maximum(system.length, 1.0),
         positions=JointValues(positions.terms, demand.misses(configuration)),
         speeds=misses,
         off_branch=off_branch,
