@@ -182,11 +182,10 @@ class Observables(NamedTuple):
         rows = self._self_stresses()[0][:, topology.num_rows - len(topology.constraints) :]
         return jnp.max(jnp.abs(rows), axis=0, initial=0.0) <= UNCHANGED
 
-    def kinetic_energy(self) -> Float[Array, ""]:
-        return kinetic_energy(self.motion)
-
-    def potential_energy(self) -> Scalar:
-        return potential_energy(self.configuration)
+    def energies(self) -> tuple[Float[Array, ""], Scalar]:
+        """Kinetic and potential energy [J]."""
+        motion = self.motion
+        return kinetic_energy(motion), potential_energy(motion.configuration)
 
     def power(self) -> Power:
         motion, configuration = self.motion, self.configuration
@@ -208,8 +207,8 @@ class Observables(NamedTuple):
     def rank(self) -> Int[Array, ""]:
         return jnp.sum(self.tangent_space.constraint_split(self.system, self.t, self.q).inverse.rank)
 
-    def distance(self) -> Float[Array, ""]:
-        return self.tangent_space.distance(self.system, self.t, self.q)
+    def rank_and_distance(self) -> tuple[Int[Array, ""], Float[Array, ""]]:
+        return self.rank(), self.tangent_space.distance(self.system, self.t, self.q)
 
 
 def _arm(configuration, body, point):

@@ -11,7 +11,7 @@ from diffrax import ThirdOrderHermitePolynomialInterpolation
 from jaxtyping import Float, Inexact, Int
 
 from linkax.equations.coordinates import on_manifold, rates, speeds
-from linkax.equations.system import System, system_of
+from linkax.equations.system import system_of
 from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
@@ -70,20 +70,15 @@ class Samples(NamedTuple):
         """Join samples of which the second begin with the last state of the first."""
         return Samples(*(np.concatenate([part, more[1:]]) for part, more in zip(self, other, strict=True)))
 
-    def missed(self, system: System) -> Float[np.ndarray, " intervals"]:
-        """The largest error of a cubic polynomial in each interval, as a time [s], (n - 1,).
+    def missed(
+        self, off: Float[np.ndarray, " inner"], fastest: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " intervals"]:
+        """The largest error of a cubic polynomial in each interval, as a time [s], (n - 1,), see `sizes`.
 
         The polynomial over two intervals misses the state in their middle by sixteen times as much.
         """
-        t, missed = self.ts, np.full(len(self.ts), np.inf)
-        places = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
-        ends = (np.stack([part[:-2], part[2:]], axis=1) for part in (t, self.q, self.v))
-        middle = jax.vmap(lambda *interval: _on_cubic(system, *interval))(*ends, places)
-        off = np.asarray(
-            jax.vmap(lambda q, change: speeds(system.topology, q, change))(self.q[1:-1], middle - self.q[1:-1])
-        )
-        size = lambda values: np.max(np.abs(values / np.asarray(system.scales)), axis=1, initial=0.0)
-        missed[1:-1] = size(off) / 16.0 / np.maximum(size(self.v[1:-1]), np.finfo(float).tiny)
+        missed = np.full(len(self.ts), np.inf)
+        missed[1:-1] = off / 16.0 / np.maximum(fastest[1:-1], np.finfo(float).tiny)
         return np.where(np.isfinite(missed[1:]), np.maximum(missed[:-1], missed[1:]), np.inf)
 
     def pairs(self, before: Int[np.ndarray, " k"]) -> "Samples":
@@ -135,8 +130,9 @@ def _passages(solution) -> list[_Passage]:
     samples = samples.taken(samples.distances > SINGULAR)
     if len(samples.ts) < 2:
         return []
-    intervals = _candidates(solution, samples)
-    pairs, missed = samples.pairs(intervals), samples.missed(system_of(solution.mechanism, solution.q.dtype))[intervals]
+    off, fastest = map(np.asarray, sizes(solution.mechanism, samples.ts, samples.q, samples.v))
+    intervals = _candidates(samples, fastest)
+    pairs, missed = samples.pairs(intervals), samples.missed(off, fastest)[intervals]
     turned = [change.turned() for change in _between(solution, pairs, np.ones(len(pairs.ts)))[0]]
     with_ends = np.repeat(np.arange(len(turned)), [len(ends) for ends in turned])
     pairs, missed = pairs.taken(with_ends), missed[with_ends]
@@ -178,10 +174,8 @@ def _close_enough(solution) -> Samples:
     return samples if found is None else found
 
 
-def _candidates(solution, samples):
+def _candidates(samples, fastest):
     """Indices of intervals in which distances may fall to zero, given how far the joints move in them."""
-    scales = np.asarray(system_of(solution.mechanism, solution.q.dtype).scales)
-    fastest = np.max(np.abs(samples.v / scales), axis=1)
     travelled = np.maximum(fastest[1:], fastest[:-1]) * np.diff(samples.ts)
     smaller = np.minimum(samples.distances[1:], samples.distances[:-1])
     return np.flatnonzero(smaller <= FASTEST * travelled)
@@ -279,6 +273,22 @@ def _on_cubic(system, ts, qs, vs, place):
         k1=duration * rates(system.topology, qs[1], vs[1]),
     )
     return hermite.evaluate(place)
+
+
+@quick_compile
+def sizes(
+    mechanism: Mechanism, ts: Float[Array, " n"], qs: Float[Array, "n n_q"], vs: Float[Array, "n n_v"]
+) -> tuple[Float[Array, " n-2"], Float[Array, " n"]]:
+    """How far states are from the cubic polynomials between their neighbours, and their fastest speeds [1/s].
+
+    Both in radians and lengths of the mechanism.
+    """
+    system = system_of(mechanism, qs.dtype)
+    size = lambda changes: jnp.max(jnp.abs(changes / system.scales), axis=1, initial=0.0)
+    places = (ts[1:-1] - ts[:-2]) / (ts[2:] - ts[:-2])
+    ends = (jnp.stack([part[:-2], part[2:]], axis=1) for part in (ts, qs, vs))
+    off = lambda q, *interval: speeds(system.topology, q, _on_cubic(system, *interval) - q)
+    return size(jax.vmap(off)(qs[1:-1], *ends, places)), size(vs)
 
 
 @quick_compile

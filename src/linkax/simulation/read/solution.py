@@ -28,7 +28,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.tracing import concrete
+from linkax.xla.tracing import concrete, jit_inline
 
 # A point of a body: a frame, a position on it, or None for its centre of mass, see `Solution.position`.
 BodyPoint = str | Number | Vector | None
@@ -228,15 +228,16 @@ class Solution(eqx.Module):
 
     def energy(self) -> Float[Array, "*batch n_t"]:
         """Kinetic plus potential energy [J]."""
-        return self.kinetic_energy() + self.potential_energy()
+        kinetic, potential = read(Observables.energies, self)
+        return kinetic + potential
 
     def kinetic_energy(self) -> Float[Array, "*batch n_t"]:
         """Kinetic energy [J]."""
-        return read(Observables.kinetic_energy, self)
+        return read(Observables.energies, self)[0]
 
     def potential_energy(self) -> Float[Array, "*batch n_t"]:
         """Potential energy of the force elements that have one [J]."""
-        return read(Observables.potential_energy, self)
+        return read(Observables.energies, self)[1]
 
     def power(self) -> Power:
         """The rate of `energy`, by what causes it [W], each (n_t,)."""
@@ -253,21 +254,15 @@ class Solution(eqx.Module):
         joints in radians and lengths of the mechanism; the square of a speed counts as an
         acceleration, since uniform motion of the joints accelerates the bodies.
         """
-        violation, speed, acceleration = read_in_motion(Observables.violation_and_scales, self)
-        largest = lambda values: jnp.max(jnp.where(jnp.isfinite(self.ts), values, 0.0), axis=-1)
-        return Violation(
-            largest(violation.position),
-            ratio(largest(violation.velocity), largest(speed)),
-            ratio(largest(violation.acceleration), largest(acceleration)),
-        )
+        return _worst(self.ts, *read_in_motion(Observables.violation_and_scales, self))
 
     def rank(self) -> Int[Array, "*batch n_t"]:
         """Number of independent loop rows."""
-        return read(Observables.rank, self)
+        return read(Observables.rank_and_distance, self)[0]
 
     def singularity_distance(self) -> Float[Array, "*batch n_t"]:
         """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
-        return read(Observables.distance, self)
+        return read(Observables.rank_and_distance, self)[1]
 
     def error_estimate(self, reading: "Callable[[Solution], Any] | None" = None, *, factor: Number = 1e-2) -> Any:
         """How far this run is off, found by a second one that is more accurate.
@@ -377,6 +372,16 @@ class Solution(eqx.Module):
         self.mechanism.joint(name)
         values = read(function, self, name)
         return values[..., 0] if values.shape[-1] == 1 else values
+
+
+@jit_inline
+def _worst(ts, violation, speed, acceleration):
+    largest = lambda values: jnp.max(jnp.where(jnp.isfinite(ts), values, 0.0), axis=-1)
+    return Violation(
+        largest(violation.position),
+        ratio(largest(violation.velocity), largest(speed)),
+        ratio(largest(violation.acceleration), largest(acceleration)),
+    )
 
 
 def _difference(solution, reading, factor):
