@@ -33,6 +33,12 @@ def all_concrete(tree: PyTree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def zeros_of(shapes: PyTree) -> PyTree:
+    """Zeros in place of `jax.ShapeDtypeStruct`: arguments of a program that is to be compiled, and not to run."""
+    zeros = lambda leaf: np.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
+    return jax.tree.map(zeros, shapes)
+
+
 class Program:
     """A function as a program of its own: optimised, or for one run compiled in less than half of the time.
 

@@ -1,6 +1,7 @@
 """The compiled programs of a run: check its start, integrate, close what was saved."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import diffrax
@@ -28,8 +29,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
 from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
-from linkax.xla.side_by_side import side_by_side
-from linkax.xla.tracing import Program, all_concrete, concrete, jit_inline
+from linkax.xla.tracing import Program, all_concrete, concrete, jit_inline, zeros_of
 from linkax.xla.undefined import undefined_where
 
 
@@ -49,8 +49,11 @@ def integrate_run(run: Run) -> Outcome:
     if concrete(sound := sound_numbers(run.mechanism)) is None:
         initial = initial.of_numbers(sound)
     if _check_start.traces > traces and all_concrete((run, initial)):
-        with side_by_side() as compiled:
-            compiled(_closed, *_closing(run, initial, compiled(_integrate, run, initial)))
+        # While XLA compiles one program, in a thread, Python traces the next.
+        with ThreadPoolExecutor() as threads:
+            threads.submit(_integrate.lower(run, initial).compile)
+            blank = zeros_of(eqx.filter_eval_shape(_integrate, run, initial))
+            threads.submit(_closed.lower(*_closing(run, initial, blank)).compile)
     integrated = _integrate(run, initial)
     return Outcome(initial, integrated, *_closed(*_closing(run, initial, integrated)))
 
