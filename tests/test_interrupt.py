@@ -160,8 +160,8 @@ PART = {"trajectory-interrupted.npz", "summary-interrupted.json"}
         (PENDULUM, "compiling", 0.5, set()),
         (["simulate", "n-four-bar", "--set", "N=6"], "compiling", 1.0, set()),  # which compiles for seconds anywhere
         (LONG, "integrating", 0.0, set()),
-        (LONG, "integrating", 1.0, PART),  # some of its twenty segments are there
-        (PENDULUM, "reading", 0.1, PART),
+        (LONG, "integrating", 2.0, PART),  # some of its twenty segments are there
+        (PENDULUM, "reading", 0.3, PART),
         (PENDULUM, "drawing", 0.0, {"trajectory.npz", "summary.json"}),
         (PENDULUM, "drawing", 2.0, {"trajectory.npz", "summary.json"}),
         (PENDULUM, "drawing", 3.0, {"trajectory.npz", "summary.json"}),
