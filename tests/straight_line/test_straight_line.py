@@ -260,3 +260,15 @@ def test_without_jit():
     function = lambda tree: {"sum": tree["a"] + tree["b"][0], "none": None}
     given = {"a": jnp.ones(2), "b": (jnp.array(3.0),)}
     assert_same(straight_line(function)(given), function(given))
+
+
+def test_large_arrays_of_few_scalars():
+    """They are gathered from these, in lanes too."""
+
+    def sparse(x):
+        matrix = jnp.zeros((25, 30)).at[np.arange(3), np.arange(3)].set(jnp.sin(x))
+        return matrix.at[20, 7].set(x[0] * x[1])
+
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)))
+    np.testing.assert_allclose(straight_line(sparse)(x[0]), sparse(x[0]), atol=1e-15)
+    np.testing.assert_allclose(jax.vmap(straight_line(sparse))(x), jax.vmap(sparse)(x), atol=1e-15)
