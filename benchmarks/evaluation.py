@@ -21,6 +21,7 @@ from benchmarks.parts import print_parts
 from benchmarks.peers import PEERS
 from benchmarks.problems import PROBLEMS, Problem
 from linkax.equations.system import system_of
+from linkax.simulation.integrate import problem as integrated
 
 ROWS = (1, 2, 5, 10, 20, 40, 70, 100, 200)
 BODIES = (10, 30, 100, 300, 1000)
@@ -32,20 +33,19 @@ SMALLEST = 1e-30  # keeps a loop from being the same in each pass, and changes n
 def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
     """Of an evaluation at a state."""
     method, system = lx.TangentSpace().prepared(float), system_of(mechanism, float)
+    accuracies = {True: lx.Accuracy(), False: lx.Accuracy(projection="none")}
 
-    def repeated(system, q, v, count, correct):
-        def evaluate(_, carry):
-            q, v = carry
-            found_v, acceleration, found_q, _ = method.derivative(system, 0.0, q, v, correct)
-            return q + SMALLEST * found_q, v + SMALLEST * (found_v + acceleration)
-
-        return jax.lax.fori_loop(0, count, evaluate, (q, v))
+    def repeated(problem, y, count):
+        return jax.lax.fori_loop(0, count, lambda _, y: y + SMALLEST * problem.derivative(0.0, y), y)
 
     found, rows = {}, mechanism.topology.num_rows
     for correct in (True, False):
         began = time.perf_counter()
-        program = jax.jit(repeated, static_argnums=4).lower(system, state.q, state.v, 1, correct).compile()
-        found[correct] = seconds_of(lambda count, program=program: program(system, state.q, state.v, count))
+        # At no time is the state on the loops already.
+        problem = integrated.Problem(mechanism, system, method, accuracies[correct], closed_at=-1.0)
+        given = problem, problem.packed(state.q, state.v)
+        program = jax.jit(repeated).lower(*given, 1).compile()
+        found[correct] = seconds_of(lambda count, program=program, given=given: program(*given, count))
         if correct:
             compiling, memory = time.perf_counter() - began, program.memory_analysis()
     return {
