@@ -6,7 +6,8 @@ what only its own have, and ends the process. So each is in a loop that runs onc
 """
 
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
+from itertools import chain
 from typing import Any
 
 import jax
@@ -21,56 +22,125 @@ from jax.interpreters import mlir
 
 from linkax.straight_line.graph import KNOWN, Graph
 
+SPARSE = 4  # rows of an array for each one that is read, with more of which those that are read are gathered
+
+
+class Scalars:
+    """Where the scalars of a graph stand that are computed: in rows of arrays, (rows) or (rows, lanes)."""
+
+    def __init__(self, graph: Graph, lanes: tuple[int, ...]) -> None:
+        self.graph, self.lanes = graph, lanes
+        self.arrays: list[jax.Array] = []
+        self.places: dict[int, tuple[int, int]] = {}  # array and row
+
+    def __contains__(self, index: int) -> bool:
+        return index in self.places
+
+    def keep(self, indices: Sequence[int], array: jax.Array) -> None:
+        """Add an array with these scalars as its rows, but for what is known, or stands somewhere already."""
+        for row, index in enumerate(indices):
+            if self.graph.values[index] is None:
+                self.places.setdefault(index, (len(self.arrays), row))
+        self.arrays.append(array)
+
+    def together(self, indices: Iterable[int]) -> tuple[list[jax.Array], dict[int, int]]:
+        """Parts, (rows, lanes) each, of one array that has these scalars of one type, and the row of each."""
+        wanted: dict[int, list[tuple[int, int]]] = {}
+        for index in indices:
+            source, row = self.places[index]
+            wanted.setdefault(source, []).append((row, index))
+        parts, rows, first = [], {}, 0
+        for source, read in wanted.items():
+            array = self.arrays[source]
+            if len(array) > SPARSE * len(read):
+                array, read = array[np.array([row for row, _ in read])], list(enumerate(index for _, index in read))
+            parts.append(self._in_lanes(array))
+            rows.update((index, first + row) for row, index in read)
+            first += len(array)
+        return parts, rows
+
+    def dense(self, entries: np.ndarray, dtype: np.dtype) -> jax.Array:
+        """An array (lanes, ...) of scalars, known ones among them."""
+        indices = entries.ravel().tolist()
+        values = {index: self.graph.values[index] for index in indices}
+        known = [index for index, value in values.items() if value is not None]
+        parts, rows = self.together(index for index, value in values.items() if value is None)
+        first = sum(map(len, parts))
+        rows.update(zip(known, range(first, first + len(known)), strict=True))
+        parts.append(self._in_lanes(jnp.asarray(np.array([values[index] for index in known], dtype))))
+        found, read = jnp.concatenate(parts), np.array([rows[index] for index in indices], int)
+        if not np.array_equal(read, np.arange(len(found))):
+            found = found[read]
+        return jnp.moveaxis(found.reshape(*entries.shape, *self.lanes), range(entries.ndim), range(-entries.ndim, 0))
+
+    def _in_lanes(self, array):
+        """The same values in all lanes, where an array has none."""
+        same = self.lanes and array.ndim == 1
+        return jnp.broadcast_to(array[:, None] if same else array, (len(array), *self.lanes))
+
 
 class Kernel:
-    """Results of a graph as a function of some of its scalars; both as indices of scalars.
+    """Results of a graph as a function of scalars that stand somewhere; both as indices of scalars.
 
     `checked`: scalars that spoil all results where they are not finite.
     """
 
-    def __init__(self, graph: Graph, given: Container[int], results: Sequence[int], checked: Container[int]) -> None:
-        self.graph, self.results, self.checked = graph, list(results), checked
-        self.order = graph.needed(self.results, given)
-        arguments = [index for index in self.order if index in given]
-        # Arguments of one type come in one array, with a row of zeros: XLA can tell that it overlaps with no result.
-        self.types = list(dict.fromkeys(graph.dtypes[index] for index in arguments))
-        self.columns = [[index for index in arguments if graph.dtypes[index] == dtype] for dtype in self.types]
+    def __init__(self, scalars: Scalars, results: Iterable[int], checked: Container[int]) -> None:
+        self.graph, self.scalars, self.checked = scalars.graph, scalars, checked
+        # Results of one type come in one array, as do arguments.
+        self.results = self._by_type(results)
+        self.order = self.graph.needed(list(results), scalars)
+        self.arguments = self._by_type(index for index in self.order if index in scalars)
+        self.rows: list[dict[int, int]] = []
 
-    def __call__(self, scalars: dict[int, jax.Array], lanes: tuple[int, ...]) -> list[jax.Array]:
-        """Compute the results, (lanes) each, from the scalars that are given."""
+    def _by_type(self, indices):
+        columns: dict[np.dtype, list[int]] = {}
+        for index in indices:
+            columns.setdefault(self.graph.dtypes[index], []).append(index)
+        return columns
+
+    def compute(self) -> None:
+        """Add the results to the scalars."""
+        scalars, lanes = self.scalars, self.scalars.lanes
         count = math.prod(lanes)
-        rows = lambda column, dtype: [*(scalars[index] for index in column), jnp.zeros((), dtype)]
-        columns = [
-            jnp.stack([jnp.broadcast_to(row, lanes) for row in rows(column, dtype)]).reshape(-1, count)
-            for column, dtype in zip(self.columns, self.types, strict=True)
-        ]
-        finite = jnp.ones(count, bool)
-        for column, indices, dtype in zip(columns, self.columns, self.types, strict=True):
+        columns, finite = [], jnp.ones(count, bool)
+        for dtype, indices in self.arguments.items():
+            parts, rows = scalars.together(indices)
+            # With a row of zeros: XLA can tell that it overlaps with no result.
+            column = jnp.concatenate([*parts, jnp.zeros((1, *lanes), dtype)]).reshape(-1, count)
             if dtype.kind == "f":
-                passes = np.array([index not in self.checked for index in indices] + [True])[:, None]
-                finite = finite & jnp.all(jnp.isfinite(column) | passes, axis=0)
+                passes = np.ones(len(column), bool)
+                passes[[rows[index] for index in indices if index in self.checked]] = False
+                finite = finite & jnp.all(jnp.isfinite(column) | passes[:, None], axis=0)
+            columns.append(column)
+            self.rows.append(rows)
         # Behind a barrier, so that XLA knows neither that the loop runs once nor what results are beside the fusion.
         spoils = jnp.where(finite, jnp.float32(0.0), jnp.nan)
         begins, spoils = lax.optimization_barrier((jnp.any(finite), spoils))
-        types = [self.graph.dtypes[index] for index in self.results]
-        nothing = [jnp.full(count, jnp.nan if dtype.kind == "f" else 0, dtype) for dtype in types]
+        nothing = [
+            jnp.full(len(indices) * count, jnp.nan if dtype.kind == "f" else 0, dtype)
+            for dtype, indices in self.results.items()
+        ]
 
-        def compute(carry):
-            found = _kernel.bind(spoils, *(column.ravel() for column in columns), kernel=self, lanes=count)
-            return jnp.zeros((), bool), found
+        def once(carry):
+            found = iter(_kernel.bind(spoils, *(column.ravel() for column in columns), kernel=self, lanes=count))
+            together = [jnp.concatenate([next(found) for _ in indices]) for indices in self.results.values()]
+            return jnp.zeros((), bool), together
 
-        _, found = lax.while_loop(lambda carry: carry[0], compute, (begins, nothing))
-        return [array.reshape(lanes) for array in found]
+        _, found = lax.while_loop(lambda carry: carry[0], once, (begins, nothing))
+        for indices, array in zip(self.results.values(), found, strict=True):
+            scalars.keep(indices, array.reshape(len(indices), *lanes))
 
 
 def _abstract(spoils, *columns, kernel: Kernel, lanes: int):
-    return [_aval(kernel.graph, index, lanes) for index in kernel.results]
+    return [_aval(kernel.graph, index, lanes) for index in chain(*kernel.results.values())]
 
 
 def _lower(context, spoils, *columns, kernel: Kernel, lanes: int):
     graph = kernel.graph
     kind = ir.Attribute.parse("#mhlo<fusion_kind kLoop>")
-    results = [_tensor(graph, index, lanes) for index in kernel.results]
+    wanted = list(chain(*kernel.results.values()))
+    results = [_tensor(graph, index, lanes) for index in wanted]
     operands = spoils, *columns
     fusion = ir.Operation.create("mhlo.fusion", results, operands, {"fusion_kind": kind}, regions=1)
     block = fusion.regions[0].blocks.append(*(operand.type for operand in operands))
@@ -79,19 +149,19 @@ def _lower(context, spoils, *columns, kernel: Kernel, lanes: int):
     with ir.InsertionPoint(block):
         spoils, *columns = block.arguments
         values, uses = {}, spoils
-        for column, indices in zip(columns, kernel.columns, strict=True):
-            *rows, last = [part(column, row) for row in range(len(indices) + 1)]
-            values.update(zip(indices, rows, strict=True))
+        for column, rows in zip(columns, kernel.rows, strict=True):
+            values.update((index, part(column, row)) for index, row in rows.items())
+            last = part(column, column.type.shape[0] // lanes - 1)
             uses = stablehlo.add(uses, stablehlo.convert(spoils.type, last))
         _emit(context, kernel, values, lanes)
         # XLA takes it for granted that a fusion uses all of its arguments, which have a last row for that, and
         # that no result is a constant or a whole argument, as some might turn out to be.
         sound, nothing = stablehlo.is_finite(uses), {}
-        for index in kernel.results:
+        for index in wanted:
             if (dtype := graph.dtypes[index]) not in nothing:
                 nothing[dtype] = _nothing(spoils, _tensor(graph, index, lanes), lanes)
             values[index] = stablehlo.select(sound, values[index], nothing[dtype])
-        ir.Operation.create("mhlo.return", operands=[values[index] for index in kernel.results])
+        ir.Operation.create("mhlo.return", operands=[values[index] for index in wanted])
     return list(fusion.results)
 
 

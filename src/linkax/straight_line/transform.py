@@ -16,7 +16,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxlib import version as jaxlib
 
 from linkax.straight_line.graph import TooLong
-from linkax.straight_line.kernel import Kernel
+from linkax.straight_line.kernel import Kernel, Scalars
 from linkax.straight_line.known import patterns_of
 from linkax.straight_line.program import Pattern, Program, straighten
 from linkax.xla.flags import WHOLE_LOOP_BYTES, makes_kernels_of_loops
@@ -27,7 +27,6 @@ Output = TypeVar("Output")
 MOST_OPERATIONS = 30_000  # scalar ones, which take some seconds to compile
 KEPT = 16  # straight lines, of some megabytes each; others are made anew where they are compiled again
 LANES = 64  # that are computed together, in the nearest cache of a processor
-MANY_ENTRIES = 500  # of an array that is made of its distinct scalars
 BYTES_OF_A_LANE = 2 * 8  # of each argument and result; XLA counts up to 8
 
 
@@ -201,48 +200,31 @@ def _in_kernels(*operands, traced: Traced, lanes: int | None, batched: tuple[boo
     together = _lanes_together(program)
     if lanes is not None and lanes > together:
         return _in_parts(*operands, traced=traced, lanes=lanes, batched=batched, together=together)
-    graph = program.graph
-    scalars: dict[int, Any] = {}
+    scalars = Scalars(program.graph, shape)
 
     def keep(entries, array, is_batched):
         flat = jnp.moveaxis(array, 0, -1) if is_batched else array
-        flat = flat.reshape((entries.size, *shape) if is_batched else (entries.size,))
-        for place, index in enumerate(entries.ravel().tolist()):
-            if graph.values[index] is None:
-                scalars[index] = flat[place]
+        scalars.keep(entries.ravel().tolist(), flat.reshape(entries.size, *(shape if is_batched else ())))
 
     def produce(parts):
         wanted = dict.fromkeys(index for entries in parts for index in entries.ravel().tolist())
-        wanted = [index for index in wanted if index not in scalars and graph.values[index] is None]
+        wanted = [index for index in wanted if index not in scalars and program.graph.values[index] is None]
         if wanted:
-            kernel = Kernel(graph, scalars, wanted, arguments)
-            scalars.update(zip(wanted, kernel(scalars, shape), strict=True))
-
-    def dense(entries, aval):
-        if not entries.size:
-            return jnp.zeros((*shape, *entries.shape), aval.dtype)
-        known = lambda index: jnp.asarray(graph.values[index], aval.dtype)
-        parts, places = np.unique(entries, return_inverse=True)
-        # XLA takes long to compile an array of many parts; most entries of a large one are the same zero.
-        repeats = entries.size > MANY_ENTRIES
-        flat = parts if repeats else entries.ravel()
-        flat = [scalars[index] if graph.values[index] is None else known(index) for index in flat.tolist()]
-        stacked = jnp.stack([jnp.broadcast_to(scalar, shape) for scalar in flat])
-        stacked = stacked[places] if repeats else stacked
-        return jnp.moveaxis(stacked.reshape(*entries.shape, *shape), range(entries.ndim), range(-entries.ndim, 0))
+            Kernel(scalars, wanted, arguments).compute()
 
     for entries, array, is_batched in zip(program.inputs, operands, batched, strict=True):
         keep(entries, array, is_batched)
-    arguments = set(scalars)
+    arguments = set(scalars.places)
     for part in program.between:
         produce(part.reads)
         function = jaxpr_as_fun(part.traced)
-        arrays = [dense(entries, aval) for entries, aval in zip(part.reads, part.traced.in_avals, strict=True)]
+        avals = part.traced.in_avals
+        arrays = [scalars.dense(entries, aval.dtype) for entries, aval in zip(part.reads, avals, strict=True)]
         found = function(*arrays) if lanes is None else jax.vmap(function, axis_size=lanes)(*arrays)
         for entries, array in zip(part.returns, found, strict=True):
             keep(entries, array, lanes is not None)
     produce(program.outputs)
-    return [dense(entries, aval) for entries, aval in zip(program.outputs, traced.outputs, strict=True)]
+    return [scalars.dense(entries, aval.dtype) for entries, aval in zip(program.outputs, traced.outputs, strict=True)]
 
 
 def _lanes_together(program):
