@@ -272,3 +272,26 @@ def test_large_arrays_of_few_scalars():
     x = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)))
     np.testing.assert_allclose(straight_line(sparse)(x[0]), sparse(x[0]), atol=1e-15)
     np.testing.assert_allclose(jax.vmap(straight_line(sparse))(x), jax.vmap(sparse)(x), atol=1e-15)
+
+
+def test_straight_lines_over_lanes_within_others():
+    """They stay of their own, know what is the same in all lanes, and what they know of results is known after."""
+    inner = straight_line(lambda x, y: (x * y[0] + y[1], jnp.stack([y[1], 2.0 * y[1]])))
+
+    def function(x):
+        y = jnp.zeros((4, 2)).at[:, 0].set(x[:4])
+        linear, nothing = jax.vmap(inner, in_axes=(None, 0))(x[0], y)
+        return jnp.sum(jnp.sin(linear)) + jnp.sum(nothing @ x[:2])
+
+    x = jnp.array([0.3, -0.7, 1.1, 0.2])
+    # Four sines and their sums, but for none of what is zero.
+    assert operations(function, x) == (7, 1)
+    everything = lambda function: (
+        function(x),
+        jax.jacfwd(function)(x),
+        jax.grad(function)(x),
+        jax.hessian(function)(x),
+    )
+    assert_same(everything(straight_line(function)), everything(function))
+    several = jnp.stack([x, 2.0 * x, -x])
+    assert_same(jax.vmap(straight_line(function))(several), jax.vmap(function)(several))

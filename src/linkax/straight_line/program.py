@@ -60,6 +60,15 @@ def _input(graph, aval, pattern=None) -> Entries:
     return np.array(entries, dtype=int).reshape(aval.shape)
 
 
+def _pattern(graph, entries, is_batched) -> Pattern | None:
+    """What is known of an array; of a batch, what is the same in all lanes."""
+    first = entries[0] if is_batched else entries
+    same = np.all(entries == first, axis=0) if is_batched else np.ones(first.shape, bool)
+    values = [graph.values[index] if is_same else None for index, is_same in zip(first.flat, same.flat, strict=True)]
+    values = [np.nan if value is None or value.dtype.kind != "f" else float(value) for value in values]
+    return first.shape, np.array(values, float).tobytes()
+
+
 class _Walk:
     """The way through a traced function; `between`: see `Program`."""
 
@@ -115,9 +124,23 @@ class _Walk:
     _pjit = _jit
 
     def _straight_line(self, params, arrays):
-        if params["lanes"] is not None:
+        if params["lanes"] is None:
+            return self.closed(params["traced"].jaxpr, arrays)
+        # Over lanes it stays one of its own, which knows what is the same in all of them.
+        lanes, batched, graph = params["lanes"], params["batched"], self.graph
+        patterns = [_pattern(graph, array, of_batch) for array, of_batch in zip(arrays, batched, strict=True)]
+        traced = params["traced"].knowing(tuple(patterns))
+        if traced.program is None:
             raise NotStraight
-        return self.closed(params["traced"].jaxpr, arrays)
+        over_lanes = traced.over_lanes(lanes, batched)
+        returns = []
+        for entries, aval in zip(traced.program.outputs, over_lanes.out_avals, strict=True):
+            values = [traced.program.graph.values[index] for index in entries.ravel().tolist()]
+            known = [None if value is None else graph.known(value, aval.dtype) for value in values]
+            one = lambda known, aval=aval: [graph.input(aval.dtype) if index is None else index for index in known]
+            returns.append(np.array([one(known) for _ in range(lanes)], dtype=int).reshape(aval.shape))
+        self.between.append(OnArrays(over_lanes, arrays, returns))
+        return returns
 
     def _closed_call(self, params, arrays):
         return self.closed(params["call_jaxpr"], arrays)

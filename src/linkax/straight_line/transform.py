@@ -100,7 +100,7 @@ def _without_tracers(made: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
 class Traced:
     """A traced function of arrays, and what has been made of it. Two are the same where they are one object.
 
-    `known`, `most`: see `linkax.straight_line.program.straighten`.
+    `known`, `most`: see `linkax.straight_line.program.straighten`. `knowing`: the same, with more that is `known`.
     """
 
     def __init__(self, jaxpr: ClosedJaxpr, known: Sequence[Pattern | None], most: int) -> None:
@@ -110,6 +110,7 @@ class Traced:
         self.outputs = [ShapedArray(aval.shape, aval.dtype) for aval in jaxpr.out_avals]
         self.tangent, self.transposed = cache(self._tangent), cache(self._transposed)
         self.compiled = cache(self._compiled)
+        self.knowing = cache(lambda known: Traced(self.jaxpr, known, self.most))
 
     @property
     def program(self) -> Program | None:
@@ -124,6 +125,14 @@ class Traced:
     def has_tangents(self) -> tuple[bool, ...]:
         """Which results have tangents."""
         return tuple(jnp.issubdtype(aval.dtype, jnp.inexact) for aval in self.outputs)
+
+    def over_lanes(self, lanes: int, batched: tuple[bool, ...]) -> ClosedJaxpr:
+        """The straight line over lanes, as one operation that is traced."""
+        avals = [
+            ShapedArray((lanes, *aval.shape), aval.dtype) if is_batched else aval
+            for aval, is_batched in zip(self.inputs, batched, strict=True)
+        ]
+        return jax.make_jaxpr(partial(_straight.bind, traced=self, lanes=lanes, batched=batched))(*avals)
 
     def _tangent(self, moves: tuple[bool, ...]) -> "Traced":
         """The function of all arguments, and tangents of those that move, to the tangents of its real results."""

@@ -1,14 +1,12 @@
-"""Derivatives as linkax needs them: None for zero, whole Jacobians, quotients without NaN."""
+"""Derivatives as linkax needs them: None for zero, quotients without NaN."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from linkax.xla.arrays import Array
@@ -41,31 +39,3 @@ def pushforward(function: Callable[..., Output], primals: tuple, tangents: tuple
     found, change = eqx.filter_jvp(function, primals, tangents)
     numbers, _ = eqx.partition(found, eqx.is_inexact_array)
     return found, jax.tree.map(materialise, numbers, change)
-
-
-def whole_jacobian(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a function (static, *arrays) of few numbers: compute its Jacobian once, and contract it with each
-    tangent.
-
-    Of a Jacobian with many columns, few of which concern this function, it then costs no more than its own.
-    """
-
-    @partial(jax.custom_jvp, nondiff_argnums=(0,))
-    def whole(static, *arrays):
-        return function(static, *arrays)
-
-    def rule(static, arrays, tangents):
-        moves = [type(change) is not jax.custom_derivatives.SymbolicZero for change in tangents]
-        moving = lambda values: [value for value, of in zip(values, moves, strict=True) if of]
-        at, restored = ravel_pytree(moving(arrays))
-
-        def of_moving(flat):
-            moved = iter(restored(flat))
-            return function(static, *(next(moved) if of else array for array, of in zip(arrays, moves, strict=True)))
-
-        slopes = jax.vmap(lambda change: jax.jvp(of_moving, (at,), (change,))[1])(jnp.eye(len(at), dtype=at.dtype))
-        change = ravel_pytree(moving(tangents))[0]
-        return function(static, *arrays), jax.tree.map(lambda slope: jnp.tensordot(change, slope, 1), slopes)
-
-    whole.defjvp(rule, symbolic_zeros=True)
-    return whole
