@@ -6,7 +6,9 @@ from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import lineax
 import numpy as np
 import optimistix as optx
 from jax import lax
@@ -61,8 +63,24 @@ class StageNorm(eqx.Module):
 class Chord(diffrax.VeryChord):
     """diffrax's root finder for implicit steps, going on for as long as it converges.
 
-    Up to version 0.7.2 diffrax's takes a step for failed where two iterations do not suffice.
+    Up to version 0.7.2 diffrax's takes a step for failed where two iterations do not suffice, and computes twice the
+    Jacobian that it keeps over a step.
+
+    - `slopes`: ∂f/∂y where the step begins, (n, n); by default the Jacobian is diffrax's.
     """
+
+    slopes: Float[Array, "n n"] | None = None
+
+    def init(
+        self, fn: Any, y: Any, args: Any, options: dict[str, Any], f_struct: Any, aux_struct: Any, tags: Any
+    ) -> Any:
+        """Factorise 1 − γ Δt ∂f/∂y, the Jacobian of a stage's equation; its `args` have γ second and Δt last."""
+        if self.slopes is None or "init_state" in options:  # of the step, by an earlier call
+            return super().init(fn, y, args, options, f_struct, aux_struct, tags)
+        begun = super().init(lambda at, _: (at, None), y, args, options, f_struct, aux_struct, tags)
+        operator = lineax.MatrixLinearOperator(jnp.eye(len(y), dtype=y.dtype) - args[1] * args[-1] * self.slopes)
+        factors = lax.stop_gradient(self.linear_solver.init(operator, options={}))
+        return dataclasses.replace(begun, linear_state=(operator, factors))
 
     def terminate(
         self, fn: Callable, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
@@ -117,14 +135,15 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         tolerances = control.tolerances((accuracy.rtol, accuracy.atol)) if lacks else None
         return ProjectedSolver(solver, tolerances, accuracy.projection in ("both", "step"), control.is_undifferentiated)
 
-    def _stepping(self, problem, y0, duration):
+    def _stepping(self, problem, t0, y0, duration):
         """The solver for one step: its root finder measures iterates as errors of the step are measured."""
         if self.tolerances is None:
             return self.solver
         inner: Any = self.solver
         finder = inner.root_finder
         if type(finder) is diffrax.VeryChord:
-            finder = Chord(0.0, 1.0, kappa=finder.kappa, linear_solver=finder.linear_solver)
+            slopes = lax.stop_gradient(jax.jacfwd(lambda y: problem.derivative(t0, y))(y0))
+            finder = Chord(0.0, 1.0, kappa=finder.kappa, linear_solver=finder.linear_solver, slopes=slopes)
         norm = StageNorm(problem, y0, duration, self.tolerances)
         return dataclasses.replace(self.solver, root_finder=dataclasses.replace(finder, rtol=0.0, atol=1.0, norm=norm))
 
@@ -165,7 +184,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         # Solvers that begin with the last derivative of the step before must not where the state has moved since.
         switching = len(args.sides(y0)) > 0
         made_jump = True if switching or (self.after_step and args.method.moves_after_steps) else made_jump
-        solver = self._stepping(args, y0, t1 - t0)
+        solver = self._stepping(args, t0, y0, t1 - t0)
         y1, error, dense_info, inner, result = solver.step(terms, t0, t1, y0, args, solver_state.inner, made_jump)
         stages = stage_distances(dense_info, t1 - t0, self.solver)
         leaves = solver_state.arrives
