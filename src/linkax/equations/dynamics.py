@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, along_speeds
 from linkax.equations.motion import Motion
-from linkax.equations.tree_sums import along_path, expand_to_motions, over_subtree, sum_by_body, sum_by_speed
+from linkax.equations.tree_sums import along_path, expand_to_motions, over_subtree, sum_by_body
 from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
@@ -43,6 +43,8 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
 def mass_entries(configuration: Configuration) -> StaticSparse:
     """Entries of M that may differ from zero: pairs of speeds that move a common body."""
     system, topology = configuration.system, configuration.system.topology
+    if topology.motion_column is not None:
+        return StaticSparse.whole(_mass_by_bodies(configuration))
     above = lambda carried: _onto_carrier(np.array(topology.predecessor), carried)
     arm = configuration.center_of_mass()
     own_moment = system.mass[:, None] * arm
@@ -62,10 +64,22 @@ def mass_entries(configuration: Configuration) -> StaticSparse:
     across, down = np.meshgrid(np.arange(len(body)), np.arange(len(body)))
     carrier, carried = np.where(carries, down, np.where(carries.T, across, -1)), np.where(carries, across, down)
     twist, wrench = jnp.concatenate([angular, at_anchor], axis=1), jnp.concatenate([moment, momentum], axis=1)
-    found = products_of_pairs(carrier, carried, twist, wrench)
-    if topology.motion_column is None:
-        return found
-    return StaticSparse.whole(sum_by_speed(topology, sum_by_speed(topology, found.dense()).T))
+    return products_of_pairs(carrier, carried, twist, wrench)
+
+
+def _mass_by_bodies(configuration):
+    """M of speeds that move many bodies each, as those of beams do: Σ Jᵀ I J over the bodies' Jacobians."""
+    system, topology = configuration.system, configuration.system.topology
+    of_speed = np.asarray(topology.motion_column) == np.arange(topology.num_speeds)[:, None]
+    moves = topology.path[:-1, None, topology.moved_body] * of_speed  # bodies, speeds, motions
+    twist = jnp.concatenate([configuration.angular, configuration.linear], axis=1)
+    twists = constant_product(moves.reshape(-1, moves.shape[-1]), twist).reshape(*moves.shape[:2], 6)
+    angular, at_anchor = jnp.split(twists, 2, axis=2)
+    place = configuration.position[:-1] + configuration.center_of_mass()
+    linear = at_anchor + cross(angular, place[:, None, :])
+    momentum, moment = system.mass[:, None, None] * linear, rotate(world_inertia(configuration)[:, None], angular)
+    jacobian, carried = jnp.concatenate([linear, angular], axis=2), jnp.concatenate([momentum, moment], axis=2)
+    return jnp.tensordot(jacobian, carried, axes=((0, 2), (0, 2)))
 
 
 def _onto_carrier(carrier, carried):
