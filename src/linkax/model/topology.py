@@ -207,6 +207,12 @@ class Topology:
         """Find the speeds that move bodies on their predecessors; `bodies`, (n_b,), is not zero for these."""
         return np.unique(self.motions[bodies[self.moved_body] != 0.0, 1])
 
+    def read_by_joint(self, name: str) -> np.ndarray:
+        """Indices in v of the speeds that a joint's coordinates depend on: its own, or those around its loop."""
+        if name in self.speeds:
+            return np.arange(self.num_speeds)[self.speeds[name]]
+        return self._moving(self.loop[self.joints.index(name) - self.num_bodies])
+
     @cached_property
     def read_by_rows(self) -> tuple[np.ndarray, ...]:
         """Indices in v of the speeds that each loop row can depend on."""

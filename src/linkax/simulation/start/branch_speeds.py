@@ -16,6 +16,7 @@ from linkax.linalg.saddle_inverse import invert
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.initial_state import ON_BRANCH
+from linkax.simulation.start.joint_slopes import joint_slopes
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.vectors import largest
@@ -113,8 +114,8 @@ def _asked(configuration, held):
     split = ConstraintSplit.of(configuration, rank_tolerance(system.dtype))
     right = jnp.concatenate([rate(system, configuration.t), *held.values])
     scale = lax.stop_gradient(positive_or_one(largest(right)))
-    still = jnp.zeros(system.topology.num_speeds, system.dtype)
-    rows = jnp.concatenate([split.jacobian, *jax.jacfwd(lambda v: held.speeds(move(configuration, v)))(still)])
+    of_held = lambda v: held.speeds(move(configuration, v))
+    rows = jnp.concatenate([split.jacobian, *joint_slopes(of_held, system.topology, held.terms, system.dtype)])
     return _Asked(split, rows, right / scale, scale)
 
 

@@ -14,6 +14,7 @@ from linkax.equations.loops import jacobian, residual
 from linkax.equations.system import System
 from linkax.linalg.while_falling import while_falling
 from linkax.model.terms import Term
+from linkax.simulation.start.joint_slopes import joint_slopes
 from linkax.simulation.start.nearest_solution import elastic_energy, nearest_solution, nearest_solution_in, strains_of
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
@@ -64,11 +65,9 @@ class LoopClosure(eqx.Module):
     @straight_line
     def linearised(self, q: Float[Array, " n_q"]) -> tuple[Float[Array, " n"], Float[Array, "n n_v"]]:
         """The residuals and their derivative where the loops are closed; elsewhere the direction that closes them."""
-        configuration, held = configure(self.system, self.t, q), ()
-        if self.held.terms:
-            moved = lambda change: configure(self.system, self.t, retract(self.system.topology, q, change))
-            still = jnp.zeros(self.system.topology.num_speeds, q.dtype)
-            held = jax.jacfwd(lambda change: self.misses(moved(change)))(still)
+        topology, configuration = self.system.topology, configure(self.system, self.t, q)
+        moved = lambda change: configure(self.system, self.t, retract(topology, q, change))
+        held = joint_slopes(lambda change: self.misses(moved(change)), topology, self.held.terms, q.dtype)
         close_loops = as_if_closed(configuration)
         return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], *held])
 
