@@ -17,7 +17,7 @@ from linkax.xla import flags as xla_flags
 from linkax.xla import memory_maps
 from linkax.xla.flags import LOOPS, quickest_to_compile, set_flags
 from linkax.xla.memory_maps import ROOM
-from linkax.xla.tracing import quick_compile
+from linkax.xla.tracing import Program
 
 
 def _as_users_do(name):
@@ -82,7 +82,7 @@ def test_flags_that_are_given_stay(monkeypatch):
 
 
 def test_what_runs_once_has_no_part_in_transformations_of_others():
-    @quick_compile
+    @Program
     def double(x):
         return 2.0 * x
 
@@ -108,7 +108,7 @@ def _with_limit(monkeypatch, folder, *free):
 def test_programs_are_forgotten_where_memory_maps_run_out(monkeypatch, tmp_path):
     """In the middle of what is traced and compiled, which goes on."""
 
-    @quick_compile
+    @Program
     def double(x):
         return jnp.sin(2.0 * x)
 

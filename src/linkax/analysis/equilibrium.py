@@ -26,7 +26,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.tracing import all_concrete, evaluate_now, quick_compile
+from linkax.xla.tracing import Program, all_concrete, evaluate_now
 
 BALANCED_STEP = 1e-8  # last step above which the search has failed [rad, lengths of the mechanism]
 
@@ -138,7 +138,7 @@ def _check_steady(mechanism, ending, reached, t):
         )
 
 
-@quick_compile
+@Program
 def _equilibrium(mechanism, state, t, moves):
     """The state in which the search ends, and its `_Ending`."""
     system = system_in(mechanism, state, t, moves)

@@ -23,7 +23,7 @@ from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import by_joint, checked_state, checked_time, marked
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import concrete, quick_compile
+from linkax.xla.tracing import Program, concrete
 
 JointKey = str | tuple[str, int]
 Accelerations = Mapping[JointKey, ArrayLike | Sequence[float]]
@@ -87,7 +87,7 @@ def inverse_dynamics(
     return marked(mechanism, InverseDynamics(dict(zip(accelerations, forces, strict=True)), acceleration))
 
 
-@quick_compile
+@Program
 def _inverse_dynamics(mechanism, state, wanted, t):
     system, (q, v) = system_of(mechanism, state.q.dtype), (state.q, state.v)
     configuration = configure(system, t, q)

@@ -19,7 +19,7 @@ from linkax.simulation.integrate.run import DEFAULT_FORMULATION, checked_formula
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import quick_compile
+from linkax.xla.tracing import Program
 
 INVOLVED = 1e-6  # entry of a self-stress of magnitude one up to which its row counts as not part of it
 # Table 1 of the paper: which axes of parent and child each rotation row keeps orthogonal.
@@ -103,7 +103,7 @@ def mobility(
     return marked(mechanism, _mobility(mechanism, state, t, tangent_space))
 
 
-@quick_compile
+@Program
 def _mobility(mechanism, state, t, tangent_space):
     system, topology = system_of(mechanism, state.q.dtype, fixed_scales=False), mechanism.topology
     tolerance = tangent_space.prepared(system.dtype).tolerance

@@ -39,7 +39,7 @@ from linkax.simulation.start.validation import checked_state, checked_time, mark
 from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.tracing import all_concrete, concrete, quick_compile
+from linkax.xla.tracing import Program, all_concrete, concrete
 
 NEAR = 1e-6  # distance from an equilibrium up to which a state counts as in it [rad, lengths of the mechanism]
 UNFELT = 1e-9  # forces that rounding leaves, relative to all forces
@@ -189,14 +189,14 @@ def _check_steady(mechanism, state, t, steadiness):
         )
 
 
-@quick_compile
+@Program
 def _rank(mechanism, state, t):
     """Number of independent constraints, drives included."""
     system = system_in(mechanism, state, t, False)
     return jnp.sum(TangentSpace().prepared(system.dtype).constraint_split(system, t, state.q).inverse.rank)
 
 
-@quick_compile
+@Program
 def _linearise(mechanism, state, t, count, moves):
     """A `Linearisation`, the degrees of freedom counted at the state, and the `_Steadiness`."""
     system = system_in(mechanism, state, t, moves)

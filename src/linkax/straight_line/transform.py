@@ -25,6 +25,7 @@ from linkax.xla.tracing import all_concrete, evaluate_now
 Output = TypeVar("Output")
 
 MOST_OPERATIONS = 30_000  # scalar ones, which take some seconds to compile
+MOST_AT_ONCE = 4_000  # of what runs a few times: more take longer to compile than to run on arrays
 KEPT = 16  # straight lines, of some megabytes each; others are made anew where they are compiled again
 LANES = 64  # that are computed together, in the nearest cache of a processor
 BYTES_OF_A_LANE = 2 * 8  # of each argument and result; XLA counts up to 8

@@ -6,9 +6,9 @@ where there are loops. Of a function marked `jit_inline` JAX keeps what it has t
 compiles it in place, so that it runs as fast as without the mark.
 """
 
-from collections.abc import Callable
-from functools import cache, partial, wraps
-from typing import Any, TypeVar
+from collections.abc import Callable, Hashable
+from functools import cache, lru_cache, update_wrapper
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from linkax.xla.flags import quickest_to_compile
 Output = TypeVar("Output")
 
 jit_inline = eqx.filter_jit
+KINDS = 256  # of programs that are known to have been compiled
 
 
 def concrete(number: Any) -> np.ndarray | None:
@@ -33,46 +34,48 @@ def all_concrete(tree: PyTree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def zeros_of(shapes: PyTree) -> PyTree:
-    """Zeros in place of `jax.ShapeDtypeStruct`: arguments of a program that is to be compiled, and not to run."""
-    zeros = lambda leaf: np.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
-    return jax.tree.map(zeros, shapes)
+class Program(Generic[Output]):
+    """A function as a program of its own, which seldom runs more than once on the same kind of arguments.
 
-
-class Program:
-    """A function as a program of its own: optimised, or for one run compiled in less than half of the time.
-
-    - `traces`: how many kinds of arguments it has been traced for.
+    - `quick`: compiled in less than half of the time, and slower than `optimised`.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        @wraps(function)
-        def traced(*args):
-            self.traces += 1
-            return function(*args)
-
-        self.traces = 0
-        self.optimised = jit_inline(traced)
+    def __init__(self, function: Callable[..., Output]) -> None:
+        update_wrapper(self, function)
+        self.optimised = optimised = jit_inline(function)
         # XLA is asked for its options when the program runs.
-        self._quick = cache(
-            lambda: eqx.filter_jit(traced, compiler_options=quickest_to_compile())  # pyright: ignore[reportCallIssue]
+        self.quick = cache(
+            lambda: eqx.filter_jit(optimised, compiler_options=quickest_to_compile())  # pyright: ignore[reportCallIssue]
         )
 
-    def __call__(self, *args: Any) -> Any:
-        """Compute it as the quick program where that can be."""
-        return self.choose(True, *args)(*args)
+    @property
+    def lower(self) -> Callable[..., Any]:
+        """Trace the quick program, to compile it before it is called, as `jax.jit(...).lower` does."""
+        return self.quick().lower
 
-    def choose(self, quick: bool, *args: Any) -> Callable[..., Any]:
-        """Choose what to call with these arguments: the quick program for concrete ones only, if asked for.
-
-        Inside of a transformation that one is compiled by itself all the same.
-        """
-        return partial(evaluate_now, self._quick()) if quick and all_concrete(args) else self.optimised
+    def __call__(self, *args: Any) -> Output:
+        """Compute it as the quick program of concrete arguments, also while a transformation is tracing."""
+        return evaluate_now(self.quick(), *args) if all_concrete(args) else self.optimised(*args)
 
 
-def quick_compile(function: Callable[..., Output]) -> Callable[..., Output]:
-    """Decorate a function that seldom runs more than once on the same kind of arguments, see `Program`."""
-    return wraps(function)(Program(function))
+def blank_result(program: Any, *args: Any) -> PyTree:
+    """Zeros in place of what a `Program`, or a function of `jit_inline`, returns: what the next is traced with."""
+    inner = program.optimised if isinstance(program, Program) else program
+    zeros = lambda leaf: np.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
+    return jax.tree.map(zeros, eqx.filter_eval_shape(inner, *args))
+
+
+def is_first(*kind: Hashable) -> bool:
+    """Whether this is the first call with these arguments."""
+    came = _came(kind)
+    first = not came
+    came[:] = [True]
+    return first
+
+
+@lru_cache(maxsize=KINDS)
+def _came(_kind):
+    return []
 
 
 def evaluate_now(function: Callable[..., Output], *args: Any) -> Output:

@@ -17,7 +17,7 @@ from linkax.linalg.triangular import cholesky_inverse
 from linkax.simulation.explain.diagnosis import lost_inertia
 from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS, Solution
 from linkax.xla.enumerations import code, item
-from linkax.xla.tracing import all_concrete, quick_compile
+from linkax.xla.tracing import Program, all_concrete
 
 UNSEEN = 10.0  # tolerances: rounding of accelerations that adds little to the errors of steps
 UNSEEN_ULPS = 1e5
@@ -181,7 +181,7 @@ def _scales(mechanism, tangent_space, t, state):
     return system_of(mechanism, state.q.dtype).scales
 
 
-@quick_compile
+@Program
 def _rates(mechanism, tangent_space, t, state):
     """The fastest rate of each force element [1/s], (..., n): √(k / m) or c / m."""
     return _per_member(_rates_of_elements, mechanism, tangent_space, t, state)

@@ -29,7 +29,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
 from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program, all_concrete, concrete, jit_inline, zeros_of
+from linkax.xla.tracing import Program, all_concrete, blank_result, concrete, is_first, jit_inline
 from linkax.xla.undefined import undefined_where
 
 
@@ -44,16 +44,18 @@ class Outcome(NamedTuple):
 
 def integrate_run(run: Run) -> Outcome:
     """Integrate a run, in three programs: another solver, formulation or saveat compiles no more than it must."""
-    given, traces = (run.mechanism, run.known, run.state, run.t0, run.tangent_space), _check_start.traces
+    given = run.mechanism, run.known, run.state, run.t0, run.tangent_space
+    if all_concrete(run) and is_first(run.mechanism.topology, run.known):
+        with ThreadPoolExecutor() as threads:
+            # While XLA compiles one program, in a thread, Python traces the next.
+            threads.submit(_check_start.lower(*given).compile)
+            initial = blank_result(_check_start, *given)
+            threads.submit(_integrate.lower(run, initial).compile)
+            integrated = blank_result(_integrate, run, initial)
+            threads.submit(_closed.lower(*_closing(run, initial, integrated)).compile)
     initial = _check_start(*given)
     if concrete(sound := sound_numbers(run.mechanism)) is None:
         initial = initial.of_numbers(sound)
-    if _check_start.traces > traces and all_concrete((run, initial)):
-        # While XLA compiles one program, in a thread, Python traces the next.
-        with ThreadPoolExecutor() as threads:
-            threads.submit(_integrate.lower(run, initial).compile)
-            blank = zeros_of(eqx.filter_eval_shape(_integrate, run, initial))
-            threads.submit(_closed.lower(*_closing(run, initial, blank)).compile)
     integrated = _integrate(run, initial)
     return Outcome(initial, integrated, *_closed(*_closing(run, initial, integrated)))
 

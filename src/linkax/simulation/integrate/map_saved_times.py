@@ -19,8 +19,10 @@ def map_saved_times(function: Callable[..., Any], saved: Bool[Array, " n"], *arr
 
     **Arguments:** `function`: of one row of each array; `saved`: which rows were, (n,); arrays (n, ...).
     """
-    blank = jax.tree.map(_nothing, jax.eval_shape(function, *(array[0] for array in arrays)))
-    return lax.map(lambda row: lax.cond(row[0], lambda: function(*row[1:]), lambda: blank), (saved, *arrays))
+    # Traced once, not for the shapes of its results too.
+    once = jax.jit(lambda *row: function(*row))
+    blank = jax.tree.map(_nothing, jax.eval_shape(once, *(array[0] for array in arrays)))
+    return lax.map(lambda row: lax.cond(row[0], lambda: once(*row[1:]), lambda: blank), (saved, *arrays))
 
 
 def _nothing(shape):

@@ -19,7 +19,7 @@ from linkax.simulation.explain.error_estimate import has_parts, num_saves, part_
 from linkax.simulation.integrate.results import ENDED_WELL, Solution, result_name
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import quick_compile
+from linkax.xla.tracing import Program
 
 REFINEMENTS = 6
 POLISHES = 2
@@ -275,7 +275,7 @@ def _on_cubic(system, ts, qs, vs, place):
     return hermite.evaluate(place)
 
 
-@quick_compile
+@Program
 def sizes(
     mechanism: Mechanism, ts: Float[Array, " n"], qs: Float[Array, "n n_q"], vs: Float[Array, "n n_v"]
 ) -> tuple[Float[Array, " n-2"], Float[Array, " n"]]:
@@ -291,7 +291,7 @@ def sizes(
     return size(jax.vmap(off)(qs[1:-1], *ends, places)), size(vs)
 
 
-@quick_compile
+@Program
 def between_states(
     mechanism: Mechanism,
     tangent_space: TangentSpace,

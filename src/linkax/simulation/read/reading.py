@@ -2,6 +2,7 @@
 
 import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import diffrax
@@ -22,13 +23,20 @@ from linkax.simulation.start.state import State
 from linkax.straight_line.known import KnownEntries
 from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program, all_concrete
+from linkax.xla.tracing import Program, all_concrete, blank_result, is_first
 
 FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
 
 
 def read_in_motion(function: Callable[..., Any], solution: Solution, *details: Any) -> Any:
     """Read a function that needs v̇ or λ: these are solved by one program for all such functions, and passed in."""
+    mechanism, known = solution.mechanism, solution.run.known
+    if solution.q is not None and all_concrete(solution) and is_first(function, mechanism.topology, known):
+        with ThreadPoolExecutor() as threads:
+            program, *given = _asked(solution, Observables.solve, (), ())
+            threads.submit(program.lower(*given).compile)
+            program, *given = _asked(solution, function, blank_result(program, *given), details)
+            threads.submit(program.lower(*given).compile)
     return read(function, solution, *details, dynamics=read(Observables.solve, solution))
 
 
@@ -36,16 +44,24 @@ def read(function: Callable[..., Any], solution: Solution, *details: Any, dynami
     """Evaluate a function of `Observables` at all times of all members of a batch."""
     if solution.q is None:
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
-    topology, run = solution.mechanism.topology, solution.run
-    few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
-    states = solution.ts, solution.q, solution.v
-    motion = SavedMotion(run.mechanism, run.known, run.formulation, run.tangent_space, solution.rank_nearby, *states)
-    given = function, motion, dynamics, details
-    compute = lambda: _of_times.choose(few, *given)(*given)
+
+    def compute():
+        program, *given = _asked(solution, function, dynamics, details)
+        return program(*given)
+
     named = all(isinstance(detail, str) for detail in details)
     if not named or solution.ts.ndim > 1 or not all_concrete(solution):
         return compute()
     return _kept(solution, (function, *details), compute)
+
+
+def _asked(solution, function, dynamics, details):
+    """The program that reads, and its arguments."""
+    topology, run = solution.mechanism.topology, solution.run
+    few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
+    states = solution.ts, solution.q, solution.v
+    motion = SavedMotion(run.mechanism, run.known, run.formulation, run.tangent_space, solution.rank_nearby, *states)
+    return _of_times if few else _of_times.optimised, function, motion, dynamics, details
 
 
 class SavedMotion(NamedTuple):

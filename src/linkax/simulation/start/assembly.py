@@ -31,7 +31,7 @@ from linkax.simulation.start.validation import (
 )
 from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import all_concrete, quick_compile
+from linkax.xla.tracing import Program, all_concrete
 
 
 class AssemblyError(ValueError):
@@ -177,7 +177,7 @@ class _Remainder(eqx.Module):
         return held & (self.gap_in_scales.widest() <= CLOSED)
 
 
-@quick_compile
+@Program
 def _assemble(mechanism, known, positions, speeds, guess, t):
     system = system_of(mechanism, jnp.result_type(float), known=known)
     topology = system.topology

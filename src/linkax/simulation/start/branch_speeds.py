@@ -1,5 +1,7 @@
 """Speeds that the loops allow, with some of them held; in a singular configuration on a branch of the motion."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,10 +22,10 @@ from linkax.simulation.start.joint_slopes import joint_slopes
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
 from linkax.simulation.start.validation import JointValues
 from linkax.spatial.vectors import largest
-from linkax.straight_line.transform import straight_line
+from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import materialise, positive_or_one, pushforward, ratio
-from linkax.xla.tracing import quick_compile
+from linkax.xla.tracing import Program
 
 TURNS = 30  # of Newton's method: from close to where y² = x² is flat, each but halves the way
 BESIDE = 1e-2
@@ -95,7 +97,7 @@ def _on_branch(asked, v):
     return lax.fori_loop(0, TURNS, lambda _, v: _turn(asked, v), v + jnp.where(off, beside, 0.0))
 
 
-@straight_line
+@partial(straight_line, most=MOST_AT_ONCE)
 def _turn(asked, v):
     return v + nearest_solution(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
 
@@ -119,7 +121,7 @@ def _asked(configuration, held):
     return _Asked(split, rows, right / scale, scale)
 
 
-@straight_line
+@partial(straight_line, most=MOST_AT_ONCE)
 def speeds_on_branch(
     configuration: Configuration, held: JointValues
 ) -> tuple[Float[Array, " n_v"], JointValues, Float[Array, ""], Bool[Array, ""]]:
@@ -142,7 +144,7 @@ def speeds_on_branch(
     return scale * v, misses, jnp.maximum(asked.off_branch(v), asked.missed(v)), undecided
 
 
-@quick_compile
+@Program
 def other_speeds(
     mechanism: Mechanism, held: JointValues, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
 ) -> tuple[Float[Array, "k n_v"], Bool[Array, " k"]]:

@@ -1,5 +1,6 @@
 """The check of a state before motion starts: closed, on a branch of the motion, unique."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from linkax.formulations.projected_state import ranks_along
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
-from linkax.straight_line.transform import straight_line
+from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
 
 MOVES = 1e-6  # of the largest speed
@@ -107,7 +108,7 @@ class _AtStart(NamedTuple):
     on_branch: Bool[Array, ""]
 
 
-@straight_line
+@partial(straight_line, most=MOST_AT_ONCE)
 def _at_start(method, system, t, q, v) -> _AtStart:
     split, mass, acceleration, definiteness = method.at_rest(system, t, q)
     rank = split.inverse.rank
