@@ -21,50 +21,75 @@ from jax.extend.mlir.dialects import stablehlo
 from jax.interpreters import mlir
 
 from linkax.straight_line.graph import KNOWN, Graph
+from linkax.straight_line.program import Program
 
 SPARSE = 4  # rows of an array for each one that is read, with more of which those that are read are gathered
 
 
-class Scalars:
-    """Where the scalars of a graph stand that are computed: in rows of arrays, (rows) or (rows, lanes)."""
+class Layout:
+    """Where the scalars of a graph stand that are computed: in rows of arrays, which have `sizes`."""
 
-    def __init__(self, graph: Graph, lanes: tuple[int, ...]) -> None:
-        self.graph, self.lanes = graph, lanes
-        self.arrays: list[jax.Array] = []
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.sizes: list[int] = []
         self.places: dict[int, tuple[int, int]] = {}  # array and row
 
     def __contains__(self, index: int) -> bool:
         return index in self.places
 
-    def keep(self, indices: Sequence[int], array: jax.Array) -> None:
-        """Add an array with these scalars as its rows, but for what is known, or stands somewhere already."""
+    def add(self, indices: Sequence[int]) -> None:
+        """Note an array with these scalars as its rows, but for what is known, or stands somewhere already."""
         for row, index in enumerate(indices):
             if self.graph.values[index] is None:
-                self.places.setdefault(index, (len(self.arrays), row))
-        self.arrays.append(array)
+                self.places.setdefault(index, (len(self.sizes), row))
+        self.sizes.append(len(indices))
 
-    def together(self, indices: Iterable[int]) -> tuple[list[jax.Array], dict[int, int]]:
-        """Parts, (rows, lanes) each, of one array that has these scalars of one type, and the row of each."""
+    def find(self, indices: Iterable[int]) -> tuple[list[tuple[int, np.ndarray | None]], dict[int, int], int]:
+        """How to make one array that has these scalars: of which arrays, and which of their rows, None for all.
+
+        Also the row of each scalar in it, and how many rows it has.
+        """
         wanted: dict[int, list[tuple[int, int]]] = {}
         for index in indices:
             source, row = self.places[index]
             wanted.setdefault(source, []).append((row, index))
         parts, rows, first = [], {}, 0
         for source, read in wanted.items():
-            array = self.arrays[source]
-            if len(array) > SPARSE * len(read):
-                array, read = array[np.array([row for row, _ in read])], list(enumerate(index for _, index in read))
-            parts.append(self._in_lanes(array))
+            size, chosen = self.sizes[source], None
+            if size > SPARSE * len(read):
+                size, chosen = len(read), np.array([row for row, _ in read])
+                read = list(enumerate(index for _, index in read))
+            parts.append((source, chosen))
             rows.update((index, first + row) for row, index in read)
-            first += len(array)
-        return parts, rows
+            first += size
+        return parts, rows, first
+
+
+class Scalars(Layout):
+    """The same with the arrays, (rows) or (rows, lanes)."""
+
+    def __init__(self, graph: Graph, lanes: tuple[int, ...]) -> None:
+        super().__init__(graph)
+        self.lanes = lanes
+        self.arrays: list[jax.Array] = []
+
+    def keep(self, indices: Sequence[int], array: jax.Array) -> None:
+        """Add an array with these scalars as its rows."""
+        self.add(indices)
+        self.arrays.append(array)
+
+    def read(self, indices: Iterable[int]) -> tuple[list[jax.Array], dict[int, int]]:
+        """Parts, (rows, lanes) each, of one array that has these scalars of one type, and the row of each."""
+        parts, rows, _ = self.find(indices)
+        whole = lambda source, chosen: self.arrays[source] if chosen is None else self.arrays[source][chosen]
+        return [self._in_lanes(whole(*part)) for part in parts], rows
 
     def dense(self, entries: np.ndarray, dtype: np.dtype) -> jax.Array:
         """An array (lanes, ...) of scalars, known ones among them."""
         indices = entries.ravel().tolist()
         values = {index: self.graph.values[index] for index in indices}
         known = [index for index, value in values.items() if value is not None]
-        parts, rows = self.together(index for index, value in values.items() if value is None)
+        parts, rows = self.read(index for index, value in values.items() if value is None)
         first = sum(map(len, parts))
         rows.update(zip(known, range(first, first + len(known)), strict=True))
         parts.append(self._in_lanes(jnp.asarray(np.array([values[index] for index in known], dtype))))
@@ -82,16 +107,18 @@ class Scalars:
 class Kernel:
     """Results of a graph as a function of scalars that stand somewhere; both as indices of scalars.
 
-    `checked`: scalars that spoil all results where they are not finite.
+    `checked`: scalars that spoil all results where they are not finite. `size`: rows that it reads and writes.
     """
 
-    def __init__(self, scalars: Scalars, results: Iterable[int], checked: Container[int]) -> None:
-        self.graph, self.scalars, self.checked = scalars.graph, scalars, checked
+    def __init__(self, layout: Layout, results: Iterable[int], checked: Container[int]) -> None:
+        self.graph, self.checked = layout.graph, checked
         # Results of one type come in one array, as do arguments.
         self.results = self._by_type(results)
-        self.order = self.graph.needed(list(results), scalars)
-        self.arguments = self._by_type(index for index in self.order if index in scalars)
-        self.rows: list[dict[int, int]] = []
+        self.order = self.graph.needed(list(results), layout)
+        self.arguments = self._by_type(index for index in self.order if index in layout)
+        found = [layout.find(indices) for indices in self.arguments.values()]
+        self.rows = [rows for _, rows, _ in found]
+        self.size = sum(size for *_, size in found) + sum(map(len, self.results.values()))
 
     def _by_type(self, indices):
         columns: dict[np.dtype, list[int]] = {}
@@ -99,13 +126,13 @@ class Kernel:
             columns.setdefault(self.graph.dtypes[index], []).append(index)
         return columns
 
-    def compute(self) -> None:
-        """Add the results to the scalars."""
-        scalars, lanes = self.scalars, self.scalars.lanes
+    def compute(self, scalars: Scalars) -> None:
+        """Add the results to scalars with the layout that it was made for."""
+        lanes = scalars.lanes
         count = math.prod(lanes)
         columns, finite = [], jnp.ones(count, bool)
         for dtype, indices in self.arguments.items():
-            parts, rows = scalars.together(indices)
+            parts, rows = scalars.read(indices)
             # With a row of zeros: XLA can tell that it overlaps with no result.
             column = jnp.concatenate([*parts, jnp.zeros((1, *lanes), dtype)]).reshape(-1, count)
             if dtype.kind == "f":
@@ -113,7 +140,6 @@ class Kernel:
                 passes[[rows[index] for index in indices if index in self.checked]] = False
                 finite = finite & jnp.all(jnp.isfinite(column) | passes[:, None], axis=0)
             columns.append(column)
-            self.rows.append(rows)
         # Behind a barrier, so that XLA knows neither that the loop runs once nor what results are beside the fusion.
         spoils = jnp.where(finite, jnp.float32(0.0), jnp.nan)
         begins, spoils = lax.optimization_barrier((jnp.any(finite), spoils))
@@ -130,6 +156,27 @@ class Kernel:
         _, found = lax.while_loop(lambda carry: carry[0], once, (begins, nothing))
         for indices, array in zip(self.results.values(), found, strict=True):
             scalars.keep(indices, array.reshape(len(indices), *lanes))
+
+
+def kernels_of(program: Program) -> list[Kernel | None]:
+    """The kernels of a program: for what each part that stays on arrays reads, and for its results; None for nothing.
+
+    In that order they find what they read where `Scalars` keep it.
+    """
+    graph, layout = program.graph, Layout(program.graph)
+    keep = lambda arrays: [layout.add(entries.ravel().tolist()) for entries in arrays]
+    keep(program.inputs)
+    arguments, kernels = set(layout.places), []
+    for reads, returns in [*((part.reads, part.returns) for part in program.between), (program.outputs, [])]:
+        wanted = dict.fromkeys(index for entries in reads for index in entries.ravel().tolist())
+        wanted = [index for index in wanted if index not in layout and graph.values[index] is None]
+        kernel = Kernel(layout, wanted, arguments) if wanted else None
+        if kernel is not None:
+            for indices in kernel.results.values():
+                layout.add(indices)
+        kernels.append(kernel)
+        keep(returns)
+    return kernels
 
 
 def _abstract(spoils, *columns, kernel: Kernel, lanes: int):

@@ -16,10 +16,10 @@ from jax.interpreters import ad, batching, mlir
 from jaxlib import version as jaxlib
 
 from linkax.straight_line.graph import TooLong
-from linkax.straight_line.kernel import Kernel, Scalars
+from linkax.straight_line.kernel import Scalars, kernels_of
 from linkax.straight_line.known import patterns_of
 from linkax.straight_line.program import Pattern, Program, straighten
-from linkax.xla.flags import WHOLE_LOOP_BYTES, makes_kernels_of_loops
+from linkax.xla.flags import makes_kernels_of_loops
 from linkax.xla.tracing import all_concrete, evaluate_now
 
 Output = TypeVar("Output")
@@ -27,8 +27,9 @@ Output = TypeVar("Output")
 MOST_OPERATIONS = 30_000  # scalar ones, which take some seconds to compile
 MOST_AT_ONCE = 4_000  # of what runs a few times: more take longer to compile than to run on arrays
 KEPT = 16  # straight lines, of some megabytes each; others are made anew where they are compiled again
-LANES = 64  # that are computed together, in the nearest cache of a processor
-BYTES_OF_A_LANE = 2 * 8  # of each argument and result; XLA counts up to 8
+LANES = 64  # that are computed together
+NEAR_BYTES = 2**15  # that a kernel reads and writes, for the nearest cache of a processor
+BYTES_OF_A_LANE = 8  # of each argument and result
 
 
 def straight_line(function: Callable[..., Output], most: int = MOST_OPERATIONS) -> Callable[..., Output]:
@@ -205,48 +206,44 @@ def _on_arrays(*operands, traced: Traced, lanes: int | None, batched: tuple[bool
 
 def _in_kernels(*operands, traced: Traced, lanes: int | None, batched: tuple[bool, ...]):
     """A straight line on a CPU."""
-    program, shape = traced.program, () if lanes is None else (lanes,)
+    program = traced.program
     assert program is not None
-    together = _lanes_together(program)
-    if lanes is not None and lanes > together:
-        return _in_parts(*operands, traced=traced, lanes=lanes, batched=batched, together=together)
+    kernels = kernels_of(program)
+    compute = partial(_kernel_by_kernel, program, kernels, traced.outputs)
+    rows = max((kernel.size for kernel in kernels if kernel is not None), default=1)
+    together = max(1, min(LANES, NEAR_BYTES // (BYTES_OF_A_LANE * rows)))
+    if lanes is None or lanes <= together:
+        return compute(*operands, lanes=lanes, batched=batched)
+    return _in_parts(compute, *operands, lanes=lanes, batched=batched, together=together)
+
+
+def _kernel_by_kernel(program, kernels, outputs, *operands, lanes, batched):
+    shape = () if lanes is None else (lanes,)
     scalars = Scalars(program.graph, shape)
 
     def keep(entries, array, is_batched):
         flat = jnp.moveaxis(array, 0, -1) if is_batched else array
         scalars.keep(entries.ravel().tolist(), flat.reshape(entries.size, *(shape if is_batched else ())))
 
-    def produce(parts):
-        wanted = dict.fromkeys(index for entries in parts for index in entries.ravel().tolist())
-        wanted = [index for index in wanted if index not in scalars and program.graph.values[index] is None]
-        if wanted:
-            Kernel(scalars, wanted, arguments).compute()
-
     for entries, array, is_batched in zip(program.inputs, operands, batched, strict=True):
         keep(entries, array, is_batched)
-    arguments = set(scalars.places)
-    for part in program.between:
-        produce(part.reads)
-        function = jaxpr_as_fun(part.traced)
-        avals = part.traced.in_avals
-        arrays = [scalars.dense(entries, aval.dtype) for entries, aval in zip(part.reads, avals, strict=True)]
-        found = function(*arrays) if lanes is None else jax.vmap(function, axis_size=lanes)(*arrays)
-        for entries, array in zip(part.returns, found, strict=True):
-            keep(entries, array, lanes is not None)
-    produce(program.outputs)
-    return [scalars.dense(entries, aval.dtype) for entries, aval in zip(program.outputs, traced.outputs, strict=True)]
+    for part, kernel in zip([*program.between, None], kernels, strict=True):
+        if kernel is not None:
+            kernel.compute(scalars)
+        if part is not None:
+            function = jaxpr_as_fun(part.traced)
+            avals = part.traced.in_avals
+            arrays = [scalars.dense(entries, aval.dtype) for entries, aval in zip(part.reads, avals, strict=True)]
+            found = function(*arrays) if lanes is None else jax.vmap(function, axis_size=lanes)(*arrays)
+            for entries, array in zip(part.returns, found, strict=True):
+                keep(entries, array, lanes is not None)
+    return [scalars.dense(entries, aval.dtype) for entries, aval in zip(program.outputs, outputs, strict=True)]
 
 
-def _lanes_together(program):
-    """As many lanes as make the loop in a `Kernel` a small one for XLA."""
-    inside = [entries for part in program.between for entries in (*part.reads, *part.returns)]
-    entries = sum(part.size for part in (*program.inputs, *program.outputs, *inside))
-    return max(1, min(LANES, WHOLE_LOOP_BYTES // (BYTES_OF_A_LANE * max(entries, 1))))
-
-
-def _in_parts(*operands, traced, lanes, batched, together):
+def _in_parts(compute, *operands, lanes, batched, together):
     """A straight line over many lanes, some at a time."""
     parts = -(-lanes // together)
+    together = -(-lanes // parts)
 
     def split(array):
         filled = jnp.concatenate([array, jnp.broadcast_to(array[:1], (parts * together - lanes, *array.shape[1:]))])
@@ -257,7 +254,7 @@ def _in_parts(*operands, traced, lanes, batched, together):
     def of_part(part):
         mine = iter(part)
         arrays = [next(mine) if is_batched else array for array, is_batched in zip(operands, batched, strict=True)]
-        return _in_kernels(*arrays, traced=traced, lanes=together, batched=batched)
+        return compute(*arrays, lanes=together, batched=batched)
 
     found = lax.map(of_part, wide)
     return [array.reshape(parts * together, *array.shape[2:])[:lanes] for array in found]
