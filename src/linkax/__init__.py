@@ -85,6 +85,7 @@ from linkax.simulation.integrate.results import RESULTS as RESULTS  # noqa: E402
 from linkax.simulation.integrate.results import AccuracyWarning as AccuracyWarning  # noqa: E402
 from linkax.simulation.integrate.results import SimulationError as SimulationError  # noqa: E402
 from linkax.simulation.integrate.results import StiffnessWarning as StiffnessWarning  # noqa: E402
+from linkax.simulation.integrate.rosenbrock import Rodas5P as Rodas5P  # noqa: E402
 from linkax.simulation.integrate.runge_kutta import RungeKutta4 as RungeKutta4  # noqa: E402
 from linkax.simulation.read.observables import Pose as Pose  # noqa: E402
 from linkax.simulation.read.observables import Power as Power  # noqa: E402

@@ -105,10 +105,10 @@ def arm(elements=2, **options):
         ({}, 1e-8, 0.2, diffrax.Dopri8),
         ({"stretch": True}, 1e-8, 0.2, diffrax.Dopri8),
         ({"damping": 1e-4}, 1e-8, 0.2, diffrax.Dopri8),
-        ({"elements": 8, "damping": 1e-4}, 1e-8, 0.02, diffrax.Kvaerno5),
-        ({}, 1e-4, 0.2, diffrax.Kvaerno5),
-        ({}, 1e-8, 20.0, diffrax.Kvaerno5),
-        ({}, None, 0.2, diffrax.Kvaerno5),
+        ({"elements": 8, "damping": 1e-4}, 1e-8, 0.02, lx.Rodas5P),
+        ({}, 1e-4, 0.2, lx.Rodas5P),
+        ({}, 1e-8, 20.0, lx.Rodas5P),
+        ({}, None, 0.2, lx.Rodas5P),
     ],
 )
 def test_the_default_solver_is_the_quicker_one(options, rtol, duration, expected):

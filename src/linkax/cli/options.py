@@ -14,13 +14,17 @@ import diffrax
 import linkax as lx
 from linkax.scenes import Scene, scene
 from linkax.simulation.integrate.default_solver import default_solver
+from linkax.simulation.integrate.rosenbrock import Rodas5P
 from linkax.simulation.integrate.runge_kutta import RungeKutta4
 from linkax.studies.files import remove_unfinished, writable_folder, written_whole
 from linkax_command import at_interrupt
 
 PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
 OF_DIFFRAX = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno5")
-SOLVERS = {name.lower(): getattr(diffrax, name) for name in OF_DIFFRAX} | {"rk4": RungeKutta4}
+SOLVERS = {name.lower(): getattr(diffrax, name) for name in OF_DIFFRAX} | {
+    "rodas5p": Rodas5P,
+    "rk4": RungeKutta4,
+}
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +35,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", dest="changes", action="append", default=[], metavar="NAME=VALUE", help="a parameter")
     parser.add_argument("--preset", default="balanced", type=one_of(PRESETS), help=f"{', '.join(PRESETS)}")
     parser.add_argument("--rtol", type=positive, metavar="X", help="tolerance of a step, instead of the preset's")
-    solvers = f"{', '.join(SOLVERS)} (default: dopri8, or kvaerno5 for damped beams)"
+    solvers = f"{', '.join(SOLVERS)} (default: dopri8, or rodas5p for damped beams)"
     parser.add_argument("--solver", type=one_of(SOLVERS), help=solvers)
     parser.add_argument("--dt", type=positive, metavar="S", help="fixed steps [s], instead of ones that adapt")
     parser.add_argument("--out", type=_path, metavar="DIR", help="folder for the files (default: under linkax-out)")

@@ -53,7 +53,7 @@ def simulate(
     - `saveat`: as in diffrax; default 201 times, evenly from t0 to t1. What is saved lies on the
       closed loops, as does the `State` that a `fn` of its own gets by (t, state, mechanism), but for
       classical formulations without a correction.
-    - `solver`: a diffrax solver; default `Dopri8`, for some mechanisms with beams `Kvaerno5`, see
+    - `solver`: a diffrax solver; default `Dopri8`, for some mechanisms with beams `linkax.Rodas5P`, see
       `linkax.simulation.integrate.default_solver`.
     - `stepsize_controller`: replaces rtol and atol of `accuracy`. It sees coordinates in radians
       and lengths of the mechanism, each of magnitude one, and speeds relative to the largest.

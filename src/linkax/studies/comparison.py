@@ -259,7 +259,7 @@ def evaluations(solver: diffrax.AbstractSolver, steps: int, anew: bool = False) 
     `anew`: whether each step evaluates them at its start, also where its method could reuse the last stage.
     """
     tableau = getattr(solver, "tableau", None)
-    if tableau is None:
+    if not isinstance(tableau, diffrax.ButcherTableau):
         return None
     reused = tableau.fsal and not anew
     return steps * (tableau.num_stages - reused) + int(reused)

@@ -16,6 +16,7 @@ from linkax.linalg.spectral_radius import spectral_radius
 from linkax.linalg.triangular import cholesky_inverse
 from linkax.simulation.explain.diagnosis import lost_inertia
 from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS, Solution
+from linkax.simulation.integrate.rosenbrock import Rodas5P
 from linkax.xla.enumerations import code, item
 from linkax.xla.tracing import Program, all_concrete
 
@@ -123,7 +124,7 @@ def _is_stiff(solution, known):
     if known is np.asarray and not np.any(suspect):
         return never
     turned = known(jnp.max(_rates(*_ends(solution)), axis=-1)) * step
-    is_implicit = isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver)
+    is_implicit = isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver | Rodas5P)
     return suspect & (turned > FAST) & (turned < (RESOLVED if is_implicit else np.inf))
 
 
@@ -133,9 +134,9 @@ def _stiff(solution):
     explicit = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
     rigid = (
         "take a rigid joint or constraint in its place, or, where it has come to rest or the tolerance is loose, "
-        "solver=diffrax.Kvaerno5()"
+        "solver=linkax.Rodas5P()"
     )
-    advice = explicit if isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver) else rigid
+    advice = explicit if isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver | Rodas5P) else rigid
     return (
         f" {solution.mechanism.forces[fastest].display_name}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not "
         f"the motion, chooses the {int(solution.stats['num_steps'])} steps, {step:.1e} s each; {advice}."

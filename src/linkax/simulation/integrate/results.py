@@ -97,7 +97,7 @@ class REMARKS(eqx.Enumeration):
     )
     stiff = (
         "A stiff spring, damper or beam, and not the motion, chooses the steps. Take a rigid joint or constraint in "
-        "its place, or, with an explicit solver, solver=diffrax.Kvaerno5()."
+        "its place, or, with an explicit solver, solver=linkax.Rodas5P()."
     )
 
 

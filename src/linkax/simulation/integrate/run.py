@@ -108,7 +108,7 @@ class Run(eqx.Module):
         check_accuracy(accuracy)
         check_kinds(**{name: entry for name, entry in given.items() if name not in ("dt0", "max_steps")})
         formulation = checked_formulation(formulation, accuracy)
-        options = _filled_in(mechanism, accuracy, t0, t1, **given)
+        options = _filled_in(mechanism, state, accuracy, t0, t1, **given)
         known = KnownEntries.of(mechanism)
         mechanism, state, t0, accuracy = cast((mechanism, state, t0, accuracy), dtype)
         saves = saves_times(options.saveat)
@@ -193,13 +193,13 @@ def checked_formulation(
     return deprecated
 
 
-def _filled_in(mechanism, accuracy, t0, t1, *, solver, stepsize_controller, dt0, max_steps, saveat, **others):
+def _filled_in(mechanism, state, accuracy, t0, t1, *, solver, stepsize_controller, dt0, max_steps, saveat, **others):
     """`DiffraxOptions` with defaults in place of None."""
     if stepsize_controller is None:
         stepsize_controller = diffrax.PIDController(rtol=accuracy.rtol, atol=accuracy.atol)
     if solver is None:
         rtol, _ = MechanismControl(stepsize_controller).tolerances((None, None))
-        solver = default_solver(mechanism, rtol, t1 - t0)
+        solver = default_solver(mechanism, rtol, t1 - t0, state)
     dt0 = check_steps(solver, stepsize_controller, dt0, max_steps, t0, t1)
     if saveat is None:
         evenly = np.linspace if all_concrete((t0, t1)) else jnp.linspace
