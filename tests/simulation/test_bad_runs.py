@@ -43,7 +43,8 @@ def _nothing_compiled(monkeypatch):
     def never(*arguments):
         pytest.fail("refused only after a program was made")
 
-    monkeypatch.setattr(tracing.Program, "choose", never)
+    monkeypatch.setattr(tracing.Program, "__call__", never)
+    monkeypatch.setattr(tracing.Program, "lower", property(never))
 
 
 NO_NUMBER = [np.nan, np.inf, None, "long", "1.0", 1.0j, True, [1.0, 2.0], jnp.asarray([1.0]), jnp.asarray(np.nan), {}]
