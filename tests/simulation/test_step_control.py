@@ -1,6 +1,7 @@
 """The step control, on steps that are made up; when implicit steps are given up; what chooses the steps is told."""
 
 from contextlib import nullcontext
+from functools import partial
 from types import SimpleNamespace
 
 import diffrax
@@ -11,6 +12,7 @@ import optimistix as optx
 import pytest
 
 import linkax as lx
+from linkax.scenes import SCENES
 from linkax.simulation.integrate.diffrax_contract import StepError
 from linkax.simulation.integrate.projected_solver import Chord, retry_factors
 from linkax.simulation.integrate.step_control import MechanismControl
@@ -164,6 +166,27 @@ def test_implicit_steps_go_on_while_they_converge(rtol):
     state, accuracy = lx.assemble(mechanism, {"hinge": 0.3}), lx.Accuracy(rtol=rtol)
     stats = lx.simulate(mechanism, state, t1=5.0, solver=diffrax.Kvaerno5(), accuracy=accuracy).stats
     assert stats["num_rejected_steps"] < stats["num_accepted_steps"] / 4
+
+
+def test_derivatives_over_steps_whose_equations_have_no_solution():
+    """The first step, of the whole time, and some after it fail, and are tried again, shorter."""
+    scene = SCENES["crank-slider"]
+    settings = scene.settings("SC1", {})
+    start, accuracy = scene.initial(scene.mechanism(settings), settings), lx.Accuracy(1e-7)
+    options = {"solver": diffrax.Kvaerno5(), "accuracy": accuracy, "dt0": 2.0, "saveat": diffrax.SaveAt(t1=True)}
+
+    @jax.jit
+    @partial(jax.value_and_grad, has_aux=True)
+    def run(mass):
+        mechanism = scene.mechanism(scene.settings("SC1", {"slider_mass": mass}))
+        solution = lx.simulate(mechanism, start, t1=2.0, **options)
+        return solution.end.q[0], solution.stats["num_rejected_steps"]
+
+    (_, rejected), slope = run(1.0)
+    step = 1e-3
+    ends = [run(1.0 + change)[0][0] for change in (step, -step)]
+    assert rejected > 5
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2.0 * step), rtol=1e-4)
 
 
 @pytest.mark.parametrize(("tolerance", "ends"), [(1e-2, True), (1e-4, False)])

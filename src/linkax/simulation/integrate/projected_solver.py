@@ -97,6 +97,20 @@ class Chord(diffrax.VeryChord):
         result = optx.RESULTS.where(diverged & jnp.logical_not(failed), optx.RESULTS.nonlinear_divergence, state.result)
         return failed | converged | diverged, result
 
+    def postprocess(
+        self,
+        fn: Any,
+        y: Float[Array, "*shape"],
+        aux: Any,
+        args: Any,
+        options: dict[str, Any],
+        state: Any,
+        tags: Any,
+        result: optx.RESULTS,
+    ) -> tuple[Float[Array, "*shape"], Any, dict[str, Any]]:
+        """Return zero rates where they diverge: the step is rejected, and its derivatives must be numbers."""
+        return jnp.where(result == optx.RESULTS.successful, y, 0.0), aux, {}
+
 
 class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
     """Wrap any diffrax solver: it puts the state back on the closed loops after each step.
@@ -189,7 +203,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         stages = stage_distances(dense_info, t1 - t0, self.solver)
         leaves = solver_state.arrives
         if self.after_step:
-            y1, error, arrives = args.corrected(t1, y1, error)
+            y1, error, arrives = _corrected(args, t1, y1, error)
         else:
             arrives = leaves if stages is None else stages[-1]
             error = None if error is None else args.errors(y1, error)
@@ -214,3 +228,13 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
     ) -> Float[Array, " n"]:
         """Correct the state after a step, and put it on these sides of switches."""
         return crossed(problem, t1, problem.corrected(t1, y1)[0] if self.after_step else y1, sides)
+
+
+def _corrected(problem, t1, y1, error):
+    """`Problem.corrected`, also where a solver tells by an infinite error that its step has failed."""
+    if error is None:
+        return problem.corrected(t1, y1)
+    # With an argument that is no number none of the results is one, nor are derivatives of a step that is rejected.
+    failed = jnp.logical_not(jnp.all(jnp.isfinite(error)))
+    y1, errors, arrives = problem.corrected(t1, y1, lax.stop_gradient(jnp.where(failed, 0.0, error)))
+    return y1, jax.tree.map(lambda error: jnp.where(failed, jnp.inf, error), errors), arrives
