@@ -26,7 +26,9 @@ BAD = {
     "simulate n-four-bar --set N=2.5": "'N' of scene 'n-four-bar' is '2.5'; it must be an integer",
     "simulate n-four-bar --set N=0": "integer of at least 1",
     "simulate pendulum --preset best": "unknown 'best'; known: draft, balanced, precise",
-    "simulate pendulum --solver euler": "unknown 'euler'; known: tsit5, dopri5, dopri8, kvaerno3, kvaerno5, rodas5p,",
+    "simulate pendulum --solver euler": (
+        "unknown 'euler'; known: tsit5, dopri5, dopri8, kvaerno3, kvaerno5, rodas5p, rk4"
+    ),
     "simulate pendulum --solver rk4": "--solver rk4 estimates no error; give its steps by --dt",
     "simulate pendulum --formulation magic": "unknown formulation 'magic'; known: tangent-space, or one of lagrange-",
     "compare pendulum --formulations tangent-space,lm": "unknown formulation 'lm'; known: tangent-space",
