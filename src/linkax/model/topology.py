@@ -216,7 +216,7 @@ class Topology:
     @cached_property
     def read_by_rows(self) -> tuple[np.ndarray, ...]:
         """Indices in v of the speeds that each loop row can depend on."""
-        around = [self._moving(bodies) for bodies in self.loop]
+        around = [self.read_by_joint(name) for name in self.joints[self.num_bodies :]]
         of_constraints = [
             np.unique([*map(self.column, terms), *(c for body in bodies for c in self._moving(self.path[body]))])
             for terms, bodies in zip(self.constraint_terms, self.constraint_bodies, strict=True)

@@ -78,20 +78,19 @@ class Scalars(Layout):
         self.add(indices)
         self.arrays.append(array)
 
-    def read(self, indices: Iterable[int]) -> tuple[list[jax.Array], dict[int, int]]:
-        """Parts, (rows, lanes) each, of one array that has these scalars of one type, and the row of each."""
-        parts, rows, _ = self.find(indices)
+    def read(self, parts: Iterable[tuple[int, np.ndarray | None]]) -> list[jax.Array]:
+        """Parts that `find` names, (rows, lanes) each, of one array of scalars of one type."""
         whole = lambda source, chosen: self.arrays[source] if chosen is None else self.arrays[source][chosen]
-        return [self._in_lanes(whole(*part)) for part in parts], rows
+        return [self._in_lanes(whole(*part)) for part in parts]
 
     def dense(self, entries: np.ndarray, dtype: np.dtype) -> jax.Array:
         """An array (lanes, ...) of scalars, known ones among them."""
         indices = entries.ravel().tolist()
         values = {index: self.graph.values[index] for index in indices}
         known = [index for index, value in values.items() if value is not None]
-        parts, rows = self.read(index for index, value in values.items() if value is None)
-        first = sum(map(len, parts))
+        places, rows, first = self.find(index for index, value in values.items() if value is None)
         rows.update(zip(known, range(first, first + len(known)), strict=True))
+        parts = self.read(places)
         parts.append(self._in_lanes(jnp.asarray(np.array([values[index] for index in known], dtype))))
         found, read = jnp.concatenate(parts), np.array([rows[index] for index in indices], int)
         if not np.array_equal(read, np.arange(len(found))):
@@ -117,7 +116,7 @@ class Kernel:
         self.order = self.graph.needed(list(results), layout)
         self.arguments = self._by_type(index for index in self.order if index in layout)
         found = [layout.find(indices) for indices in self.arguments.values()]
-        self.rows = [rows for _, rows, _ in found]
+        self.parts, self.rows = [parts for parts, *_ in found], [rows for _, rows, _ in found]
         self.size = sum(size for *_, size in found) + sum(map(len, self.results.values()))
 
     def _by_type(self, indices):
@@ -131,10 +130,9 @@ class Kernel:
         lanes = scalars.lanes
         count = math.prod(lanes)
         columns, finite = [], jnp.ones(count, bool)
-        for dtype, indices in self.arguments.items():
-            parts, rows = scalars.read(indices)
+        for (dtype, indices), parts, rows in zip(self.arguments.items(), self.parts, self.rows, strict=True):
             # With a row of zeros: XLA can tell that it overlaps with no result.
-            column = jnp.concatenate([*parts, jnp.zeros((1, *lanes), dtype)]).reshape(-1, count)
+            column = jnp.concatenate([*scalars.read(parts), jnp.zeros((1, *lanes), dtype)]).reshape(-1, count)
             if dtype.kind == "f":
                 passes = np.ones(len(column), bool)
                 passes[[rows[index] for index in indices if index in self.checked]] = False
@@ -164,7 +162,11 @@ def kernels_of(program: Program) -> list[Kernel | None]:
     In that order they find what they read where `Scalars` keep it.
     """
     graph, layout = program.graph, Layout(program.graph)
-    keep = lambda arrays: [layout.add(entries.ravel().tolist()) for entries in arrays]
+
+    def keep(arrays):
+        for entries in arrays:
+            layout.add(entries.ravel().tolist())
+
     keep(program.inputs)
     arguments, kernels = set(layout.places), []
     for reads, returns in [*((part.reads, part.returns) for part in program.between), (program.outputs, [])]:

@@ -124,8 +124,11 @@ def _is_stiff(solution, known):
     if known is np.asarray and not np.any(suspect):
         return never
     turned = known(jnp.max(_rates(*_ends(solution)), axis=-1)) * step
-    is_implicit = isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver | Rodas5P)
-    return suspect & (turned > FAST) & (turned < (RESOLVED if is_implicit else np.inf))
+    return suspect & (turned > FAST) & (turned < (RESOLVED if _is_implicit(solution) else np.inf))
+
+
+def _is_implicit(solution):
+    return isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver | Rodas5P)
 
 
 def _stiff(solution):
@@ -136,7 +139,7 @@ def _stiff(solution):
         "take a rigid joint or constraint in its place, or, where it has come to rest or the tolerance is loose, "
         "solver=linkax.Rodas5P()"
     )
-    advice = explicit if isinstance(solution.run.options.solver, diffrax.AbstractImplicitSolver | Rodas5P) else rigid
+    advice = explicit if _is_implicit(solution) else rigid
     return (
         f" {solution.mechanism.forces[fastest].display_name}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not "
         f"the motion, chooses the {int(solution.stats['num_steps'])} steps, {step:.1e} s each; {advice}."
