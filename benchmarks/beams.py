@@ -144,31 +144,21 @@ def rows_of(problem):
     exact, *_ = measured(problem, problem.reference, Choice(diffrax.Dopri8(), 1e-8))
     largest = np.max(np.abs(exact))
     error = lambda found: f"{np.max(np.abs(found - exact)) / largest:.1e}"
+
+    def row(solver, elements, found, seconds, steps):
+        return {**solver, "elements": elements, "run_s": f"{seconds:.3g}", "steps": steps, "error": error(found)}
+
     for elements in problem.elements:
         for choice in CHOICES:
-            found, seconds, steps = measured(problem, elements, choice)
-            yield {
-                "elements": elements,
-                "solver": type(choice.solver).__name__,
-                "rtol": choice.rtol,
-                "run_s": f"{seconds:.3g}",
-                "steps": steps,
-                "error": error(found),
-            }
+            solver = {"solver": type(choice.solver).__name__, "rtol": choice.rtol}
+            yield row(solver, elements, *measured(problem, elements, choice))
     if importlib.util.find_spec("exudyn"):
         from benchmarks.peers import exudyn_beams
 
         for elements in (4, 8, 16):
             for steps in PEER_STEPS:
                 points, seconds = exudyn_beams.run(problem, elements, steps)
-                found = problem.deflection(*points)
-                yield {
-                    "elements": elements,
-                    "solver": "Exudyn",
-                    "run_s": f"{seconds:.3g}",
-                    "steps": steps,
-                    "error": error(found),
-                }
+                yield row({"solver": "Exudyn"}, elements, problem.deflection(*points), seconds, steps)
 
 
 if __name__ == "__main__":
