@@ -6,7 +6,6 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jax import lax
 from jaxtyping import Float
 
 from linkax.model.numbers import (
@@ -17,6 +16,7 @@ from linkax.model.numbers import (
     like,
     namespace,
     number,
+    numbers_of,
     positive,
     require,
     require_type,
@@ -204,8 +204,8 @@ def _is_symmetric(tensor: Array) -> Any:
 
 def _principal_moments(tensor: Array, diagonal: bool) -> Float[Array, "3"]:
     """Principal moments in rising order, without derivative."""
+    tensor = numbers_of(tensor)
     xp = namespace(tensor)
-    tensor = tensor if xp is np else lax.stop_gradient(tensor)
     return xp.sort(xp.diagonal(tensor)) if diagonal else xp.linalg.eigvalsh(tensor / 2.0 + tensor.T / 2.0)
 
 

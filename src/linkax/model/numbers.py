@@ -14,13 +14,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Float
 
 from linkax.spatial.rotations import COORDINATE_AXES
 from linkax.straight_line.known import known_values, remember
 from linkax.xla.arrays import Array, Scalar
-from linkax.xla.tracing import concrete
+from linkax.xla.tracing import concrete, without_derivatives
 
 # What a user may give for a number, for several, for a matrix, and for a direction (by name, as "-x").
 Number = float | int | np.number | Array
@@ -166,13 +165,18 @@ def require(array: Array, condition: Callable[[Array], Any], what: str, remedy: 
     An array that fails raises a `ValueError` where its values are known. Where they are traced it becomes NaN, which
     the result of a simulation tells.
     """
-    known = concrete(array)
-    met = condition(lax.stop_gradient(array) if known is None else known)
+    met = condition(numbers_of(array))
     if concrete(met) is None:
         return like(jnp.where(met, array, jnp.nan), array)
     if not met:
         raise ValueError(f"{what} is {np.asarray(array).tolist()}; {remedy}")
     return array
+
+
+def numbers_of(array: Array) -> Array:
+    """The numbers of an array, without derivatives: NumPy's, but where they are not known."""
+    constant = without_derivatives(array)
+    return constant if concrete(constant) is None else np.asarray(constant)
 
 
 def like(array: Array, other: Array) -> Array:

@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 import equinox as eqx
 import jax
 import numpy as np
+from jax import lax
 from jax.core import Tracer, eval_context
 from jaxtyping import PyTree
 
@@ -34,6 +35,11 @@ def all_concrete(tree: PyTree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def without_derivatives(tree: PyTree) -> PyTree:
+    """The same numbers, constant for derivatives: concrete where they are differentiated outside of `jit`."""
+    return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if isinstance(leaf, Tracer) else leaf, tree)
+
+
 class Program(Generic[Output]):
     """A function as a program of its own, which seldom runs more than once on the same kind of arguments.
 
@@ -53,9 +59,11 @@ class Program(Generic[Output]):
         """Trace the quick program, to compile it before it is called, as `jax.jit(...).lower` does."""
         return self.quick().lower
 
-    def __call__(self, *args: Any) -> Output:
+    def __call__(self, *args: Any, **options: Any) -> Output:
         """Compute it as the quick program of concrete arguments, also while a transformation is tracing."""
-        return evaluate_now(self.quick(), *args) if all_concrete(args) else self.optimised(*args)
+        if all_concrete((args, options)):
+            return evaluate_now(self.quick(), *args, **options)
+        return self.optimised(*args, **options)
 
 
 def blank_result(program: Any, *args: Any) -> PyTree:
@@ -78,8 +86,8 @@ def _came(_kind):
     return []
 
 
-def evaluate_now(function: Callable[..., Output], *args: Any) -> Output:
+def evaluate_now(function: Callable[..., Output], *args: Any, **options: Any) -> Output:
     """Compute function(*args) of concrete arguments at once, also while a transformation is tracing."""
     # Not `jax.ensure_compile_time_eval`: with it JAX compiles each operation on constants by itself.
     with eval_context():
-        return function(*args)
+        return function(*args, **options)
