@@ -28,10 +28,9 @@ def world_inertia(configuration: Configuration) -> Float[Array, "n_b 3 3"]:
 
 def _shifted(mass, first_moment, arm):
     """Gain of a second moment of mass when its reference point moves back by `arm`, (n_b, 3, 3)."""
-    product = (
-        arm[:, :, None] * (mass[:, None] * arm + first_moment)[:, None, :] + first_moment[:, :, None] * arm[:, None, :]
-    )
-    trace = jnp.sum(arm * (mass[:, None] * arm + 2.0 * first_moment), axis=-1)
+    moved = mass[:, None] * arm + first_moment
+    product = arm[:, :, None] * moved[:, None, :] + first_moment[:, :, None] * arm[:, None, :]
+    trace = jnp.sum(arm * (moved + first_moment), axis=-1)
     return trace[:, None, None] * jnp.eye(3, dtype=arm.dtype) - product
 
 

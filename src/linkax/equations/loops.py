@@ -101,11 +101,7 @@ def rate(system: System, t: ScalarLike) -> Float[Array, " m"]:
 
 def drive_acceleration(system: System, t: ScalarLike) -> Float[Array, " m"]:
     """The part of γ that drives cause, ∂b/∂t."""
-    nothing = jnp.zeros(system.topology.num_rows, system.dtype)
-    if not is_driven(system):
-        return nothing
-    sides = jax.jvp(lambda t: rate(system, t), (t,), (jnp.ones_like(t),))[1]
-    return sides
+    return jax.jvp(lambda t: rate(system, t), (t,), (jnp.ones_like(t),))[1]
 
 
 @jit_inline
@@ -153,7 +149,5 @@ def sorted_multipliers(configuration: Configuration, multipliers: Float[Array, "
     count = topology.num_rows - len(system.constraints)
     plain, combined, constraints = jnp.split(multipliers, [count - len(topology.combining), count])
     if topology.combining:
-        combined = combined @ combining_factors(
-            configuration, row_residual(configuration, combined_rows(configuration))
-        )
+        combined = combined @ combining_factors(configuration, combination(configuration)[0])
     return Multipliers(plain, combined, constraints / system.coupling_unit)

@@ -34,9 +34,7 @@ class Structure(NamedTuple):
         plan = self.elimination
         if plan is None:
             return ranks
-        first = [
-            min((*interior, *separator)) for interior, separator in zip(plan.interior, plan.separator, strict=True)
-        ]
+        first = [min((*added, *kept)) for added, kept in zip(plan.interior, plan.separator, strict=True)]
         is_part = np.array([np.isin(first, columns) for _, columns in self.islands])
         return jnp.asarray(is_part, int) @ ranks
 

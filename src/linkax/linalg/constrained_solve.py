@@ -1,24 +1,15 @@
 """The constrained solve M a = f + Jᵀλ, J a = γ, for any rank of J, and its derivative."""
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
 
+from linkax.linalg.block_elimination import Factors
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import jit_inline
-
-
-@runtime_checkable
-class Inverse(Protocol):
-    """The inverse of [[M, −Jᵀ], [J, 0]]: `SaddleInverse` or `BlockInverse`."""
-
-    def apply(self, f: Float[Array, " n"], gamma: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """Solve for (a, λ)."""
-        ...
 
 
 class SaddlePoint(eqx.Module):
@@ -34,7 +25,7 @@ class SaddlePoint(eqx.Module):
 
 @jit_inline
 def constrained_solve(
-    inverse: Inverse,
+    inverse: Factors,
     mass: Float[Array, "n n"],
     jacobian: Float[Array, "m n"],
     f: Float[Array, " n"],
@@ -53,10 +44,7 @@ def constrained_solve(
 
     **Returns:** a, (n,), and λ, (m,); with dependent rows a and Jᵀλ are unique, λ is one of many.
     """
-
-    n = mass.shape[0]
-
-    forwards = SaddlePoint(mass, jacobian)
+    n, forwards = mass.shape[0], SaddlePoint(mass, jacobian)
     product = forwards if product is None else product
 
     def nearby(right):

@@ -1,16 +1,11 @@
 """Functions with another way of computing in a batch, where JAX's own rules cost too much or hang."""
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-
-from linkax.xla.arrays import Array
-
-SMALL = 32  # rows, up to which elimination serves batches
 
 
 def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -35,23 +30,3 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
     differentiable = jax.custom_jvp(single)
     differentiable.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
     return differentiable
-
-
-def small_in_batches(single: Callable[[Array], Any], batched: Callable[[Array], Any]) -> Callable[[Array], Any]:
-    """Compute a function of a matrix by `batched` in batches of small matrices, by `single` elsewhere."""
-
-    @jax.custom_batching.custom_vmap
-    def function(matrix):
-        outer, shape = matrix.shape[:-2], matrix.shape[-2:]
-        if not outer:
-            return (batched if shape[0] <= SMALL else single)(matrix)
-        mapped = jax.vmap(batched if shape[0] <= SMALL else one_by_one(single))
-        found = mapped(matrix.reshape(math.prod(outer), *shape))
-        return jax.tree.map(lambda part: part.reshape(*outer, *part.shape[1:]), found)
-
-    @function.def_vmap
-    def _(_size, _batched, matrix):
-        found = function(matrix)
-        return found, jax.tree.map(lambda _: True, found)
-
-    return function
