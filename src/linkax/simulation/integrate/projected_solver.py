@@ -202,11 +202,15 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         y1, error, dense_info, inner, result = solver.step(terms, t0, t1, y0, args, solver_state.inner, made_jump)
         stages = stage_distances(dense_info, t1 - t0, self.solver)
         leaves = solver_state.arrives
+        # By an infinite error a solver tells that its step has failed: of infinity no derivative is a number.
+        failed = error is not None and jnp.logical_not(jnp.all(jnp.isfinite(error)))
+        error = None if error is None else lax.stop_gradient(jnp.where(failed, 0.0, error))
         if self.after_step:
-            y1, error, arrives = _corrected(args, t1, y1, error)
+            y1, errors, arrives = args.corrected(t1, y1, error)
         else:
             arrives = leaves if stages is None else stages[-1]
-            error = None if error is None else args.errors(y1, error)
+            errors = None if error is None else args.errors(y1, error)
+        errors = jax.tree.map(lambda error: jnp.where(failed, jnp.inf, error), errors)
         if stages is None:
             passes, retry = arrives, jnp.ones_like(arrives)
         else:
@@ -221,20 +225,10 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             switch, sides = lax.stop_gradient(meet(*lax.stop_gradient((args, t0, t1, y0, y1)), within))
             y1 = args.on_sides(y1, sides) if self.is_undifferentiated else crossed(args, t1, y1, sides)
         state = SolverState(inner, arrives, closest)
-        return y1, StepError(error, leaves, passes, retry, switch), dense_info, state, result
+        return y1, StepError(errors, leaves, passes, retry, switch), dense_info, state, result
 
     def corrected(
         self, problem: Problem, t1: Float[Array, ""], y1: Float[Array, " n"], sides: Sides
     ) -> Float[Array, " n"]:
         """Correct the state after a step, and put it on these sides of switches."""
         return crossed(problem, t1, problem.corrected(t1, y1)[0] if self.after_step else y1, sides)
-
-
-def _corrected(problem, t1, y1, error):
-    """`Problem.corrected`, also where a solver tells by an infinite error that its step has failed."""
-    if error is None:
-        return problem.corrected(t1, y1)
-    # With an argument that is no number none of the results is one, nor are derivatives of a step that is rejected.
-    failed = jnp.logical_not(jnp.all(jnp.isfinite(error)))
-    y1, errors, arrives = problem.corrected(t1, y1, lax.stop_gradient(jnp.where(failed, 0.0, error)))
-    return y1, jax.tree.map(lambda error: jnp.where(failed, jnp.inf, error), errors), arrives
