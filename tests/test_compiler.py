@@ -81,6 +81,16 @@ def test_flags_that_are_given_stay(monkeypatch):
     assert os.environ["XLA_FLAGS"].startswith("--xla_backend_extra_options=something --xla_cpu_enable_fast_math=false")
 
 
+def test_versions_that_may_not_know_a_flag_get_none_that_ends_the_process(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    set_flags()
+    assert "-vectorize-memory-check-threshold" in os.environ["XLA_FLAGS"]
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(xla_flags.jaxlib, "__version__", "0.99.0")
+    set_flags()
+    assert os.environ["XLA_FLAGS"] == LOOPS
+
+
 def test_what_runs_once_has_no_part_in_transformations_of_others():
     @Program
     def double(x):

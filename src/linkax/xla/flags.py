@@ -4,9 +4,10 @@ XLA makes a kernel of each operation that it cannot fuse with others. On a CPU i
 than it runs, where a mechanism is small. A loop over few numbers becomes one kernel, unless it calls a library, as for
 products of matrices. A flag says how many are few: with more than a million bytes XLA takes twice as long to compile,
 for no gain. XLA reads it once in a process, when JAX makes its first array, and ends the process for a flag that it
-does not know; so this one is an extra option, in a list that XLA does not check. A second flag leaves fewer products to
-a library in batches; only versions that are known to know it get it. Versions tell too little of what XLA does, so it
-is tried.
+does not know; so this one is an extra option, in a list that XLA does not check. Versions tell too little of what XLA
+does, so it is tried. Two more flags are for versions alone that are known to know them. One leaves fewer products to a
+library in batches. The other is of LLVM, which computes several members of a batch at once where it can check that what
+a kernel reads and writes lies apart: by default in 128 pairs, those of 15 results.
 
 Most of the time to compile goes into optimisations, which a program that runs once does not earn back.
 """
@@ -23,8 +24,10 @@ from jaxlib import version as jaxlib
 WHOLE_LOOP_BYTES = 2**20  # read and written by one pass of a loop
 LOOP_BYTES = "xla_cpu_small_while_loop_byte_threshold"
 LOOPS = f"--xla_backend_extra_options={LOOP_BYTES}={WHOLE_LOOP_BYTES}"
+MOST_CHECKS = 2500  # of pairs: 70 results; more take long to compile
+VECTORS = f",-vectorize-memory-check-threshold={MOST_CHECKS}"
 PRODUCTS = "--xla_cpu_experimental_ynn_fusion_type="
-KNOWN_VERSIONS = ("0.10.", "0.11.", "0.12.")  # of jaxlib, that know it
+KNOWN_VERSIONS = ("0.10.", "0.11.", "0.12.")  # of jaxlib, that know both
 QUICK = {  # to compile, not to run
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
@@ -34,9 +37,8 @@ QUICK = {  # to compile, not to run
 
 def set_flags() -> None:
     """Add to the environment's `XLA_FLAGS` the flags that it does not name yet."""
-    given, flags = os.environ.get("XLA_FLAGS", ""), [LOOPS]
-    if jaxlib.__version__.startswith(KNOWN_VERSIONS):
-        flags.append(PRODUCTS)
+    given, knows = os.environ.get("XLA_FLAGS", ""), jaxlib.__version__.startswith(KNOWN_VERSIONS)
+    flags = [LOOPS + VECTORS, PRODUCTS] if knows else [LOOPS]
     added = [flag for flag in flags if flag.partition("=")[0] not in given]
     os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
