@@ -19,9 +19,10 @@ from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.least_multipliers import least_multipliers
 from linkax.linalg.saddle_inverse import invert
 from linkax.model.mechanism import Mechanism
+from linkax.model.terms import term
 from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.state import State
-from linkax.simulation.start.validation import by_joint, checked_state, checked_time, marked
+from linkax.simulation.start.validation import checked_state, checked_time, marked, speeds_by_joint
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import Program, concrete
 
@@ -64,8 +65,8 @@ def inverse_dynamics(
     **Raises:** `ValueError` where the loops do not allow the accelerations together, naming the joint.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
-    wanted = by_joint(mechanism, accelerations, "acceleration", lambda joint: len(joint.speed_units))
-    if not wanted.terms:
+    wanted = speeds_by_joint(mechanism, accelerations, "acceleration")
+    if not wanted.groups:
         raise ValueError("inverse_dynamics needs accelerations; give {joint: acceleration, ...}")
     acceleration, forces, misses = _inverse_dynamics(mechanism, state, wanted, t)
     if concrete(acceleration) is not None:
@@ -76,15 +77,17 @@ def inverse_dynamics(
                 "accelerations are not finite; give mass and inertia to bodies that move without, "
                 f"{', '.join(map(repr, massless)) or 'none here'}, and finite numbers to forces"
             )
-        scale = max(1.0, *(float(np.max(np.abs(entry), initial=0.0)) for entry in wanted.values))
-        for along, miss in zip(wanted.terms, misses, strict=True):
+        scale = max(1.0, float(np.max(np.abs(wanted.flat()), initial=0.0)))
+        for along, miss in misses.by_term():
             if not np.max(np.abs(miss), initial=0.0) <= MET * scale:
                 size = np.max(np.abs(miss))
                 raise ValueError(
                     f"the acceleration asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not allow "
                     "it together with the others, so ask for fewer"
                 )
-    return marked(mechanism, InverseDynamics(dict(zip(accelerations, forces, strict=True)), acceleration))
+    of_term = dict(forces.by_term())
+    of_joint = {key: of_term[term(key, "acceleration")] for key in accelerations}
+    return marked(mechanism, InverseDynamics(of_joint, acceleration))
 
 
 @Program
@@ -92,18 +95,14 @@ def _inverse_dynamics(mechanism, state, wanted, t):
     system, (q, v) = system_of(mechanism, state.q.dtype), (state.q, state.v)
     configuration = configure(system, t, q)
     motion, mass, loops = move(configuration, v), mass_matrix(configuration), jacobian(configuration)
-
-    def speeds(q, v):
-        return jnp.concatenate(wanted.speeds(move(configure(system, t, q), v)))
-
-    turning = jax.jvp(lambda q: speeds(q, v), (q,), (rates(system.topology, q, v),))[1]
-    along = jax.jacfwd(lambda v: speeds(q, v))(v)
+    speeds = lambda q: wanted.speeds(move(configure(system, t, q), v)).flat()
+    turning = jax.jvp(speeds, (q,), (rates(system.topology, q, v),))[1]
+    along = wanted.slopes(lambda v: wanted.speeds(move(configuration, v)), system.topology, system.dtype)
     rows = jnp.concatenate([loops, along])
-    right = jnp.concatenate([gamma(motion), jnp.concatenate(wanted.values) - turning])
+    right = jnp.concatenate([gamma(motion), wanted.flat() - turning])
     tolerance = TangentSpace().prepared(system.dtype).tolerance
     inverse = invert(mass, rows, system.scales, tolerance)
     acceleration, multipliers = constrained_solve(inverse, mass, rows, generalised_force(motion), right)
     multipliers = least_multipliers(rows, multipliers, system.scales, tolerance, inverse.rank).multipliers
-    ends = np.cumsum([len(entry) for entry in wanted.values])[:-1]
     misses = rows @ acceleration - right
-    return acceleration, jnp.split(multipliers[len(loops) :], ends), jnp.split(misses[len(loops) :], ends)
+    return acceleration, wanted.filled(multipliers[len(loops) :]), wanted.filled(misses[len(loops) :])

@@ -4,7 +4,10 @@ Vectors are in ground axes. Sums from ground to each body are products with the 
 need products along the way. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 4, gives the recursions.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
@@ -126,8 +129,13 @@ class Configuration(eqx.Module):
         topology = self.system.topology
         if name in topology.coordinates:
             return self.q[topology.coordinates[name]]
-        kind, axes, cut = self._cut(name)
-        return kind.measure(axes.T @ self.child_axes[cut], axes.T @ self.separation[cut])
+        return self.cut_coordinates([name])[0]
+
+    def cut_coordinates(self, names: Sequence[str]) -> Float[Array, "k n"]:
+        """Coordinates of cut joints of one type [rad or m]."""
+        kind, axes, cut = self._cut(names)
+        to_parent = transpose(axes)
+        return jax.vmap(kind.measure)(compose(to_parent, self.child_axes[cut]), rotate(to_parent, self.separation[cut]))
 
     def joint_displacement(self, term: Term, origin: Number) -> Float[Array, ""]:
         """A joint's coordinate less an origin [rad or m]; angles of a cut joint in [−π, π)."""
@@ -138,27 +146,27 @@ class Configuration(eqx.Module):
         displacement = self.joint_coordinates(term.joint)[index + kind.has_quaternion] - origin
         return wrapped(displacement, kind.speed_units[index] == "rad")
 
-    def _cut(self, name):
-        """Type, axes on the parent, and index of a cut joint."""
+    def _cut(self, names):
+        """Type, axes on the parents, and indices of cut joints of one type."""
         topology = self.system.topology
-        joint = topology.joints.index(name)
-        cut = joint - topology.num_bodies
-        return topology.cut_types[cut], self.joint_axes[joint], cut
+        joints = np.array([topology.joints.index(name) for name in names])
+        cut = joints - topology.num_bodies
+        return topology.cut_types[cut[0]], self.joint_axes[joints], cut
 
-    def cut_subspace(self, name: str) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-        """Motion subspace of a cut joint in ground axes, angular and linear part, (n, 3) each.
+    def cut_subspace(self, names: Sequence[str]) -> tuple[Float[Array, "k n 3"], Float[Array, "k n 3"]]:
+        """Motion subspaces of cut joints of one type in ground axes, angular and linear part, (k, n, 3) each.
 
-        Its columns dotted with the relative twist are the joint's speeds; as wrenches they are forces along the joint.
+        Their columns dotted with the relative twist are a joint's speeds; as wrenches they are forces along the joint.
         """
-        kind, axes, _ = self._cut(name)
+        kind, axes, _ = self._cut(names)
         angular = jnp.asarray(np.array(kind.angular_subspace).reshape(-1, 3), axes.dtype)
         linear = jnp.asarray((not kind.is_screw) * np.array(kind.linear_subspace).reshape(-1, 3), axes.dtype)
         if kind.angular_subspace_at is not None:
-            angular = kind.angular_subspace_at(self.joint_coordinates(name))
-        return angular @ axes.T, linear @ axes.T
+            angular = jax.vmap(kind.angular_subspace_at)(self.cut_coordinates(names))
+        return compose(angular, transpose(axes)), compose(linear, transpose(axes))
 
 
-def wrapped(angles: Scalar, is_angle: bool | Bool[Array, ""]) -> Float[Array, ""]:
+def wrapped(angles: Scalar | Float[Array, "..."], is_angle: bool | Bool[Array, "..."]) -> Float[Array, "..."]:
     """Bring differences of angles into [−π, π); leave lengths as they are."""
     return jnp.where(is_angle, jnp.mod(angles + jnp.pi, 2.0 * jnp.pi) - jnp.pi, angles)
 

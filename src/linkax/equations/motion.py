@@ -1,5 +1,6 @@
 """Twists and velocity-product accelerations of all bodies, by recursion along the tree."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from linkax.model.numbers import Number
 from linkax.model.terms import Term
 from linkax.spatial.rotations import rotate
 from linkax.spatial.screws import turn_rate
-from linkax.spatial.vectors import cross
+from linkax.spatial.vectors import cross, dot
 from linkax.straight_line.whole_jacobian import whole_jacobian
 from linkax.xla.arrays import Array
 from linkax.xla.static_scatter import scatter_static
@@ -59,17 +60,19 @@ class Motion(eqx.Module):
 
     def joint_speeds(self, name: str) -> Float[Array, " n"]:
         """Speeds of a joint, in the tree or cut [rad/s or m/s]."""
-        topology, configuration = self.system.topology, self.configuration
-        if name in topology.speeds:
-            return self.v[topology.speeds[name]]
-        joint = topology.joints.index(name)
-        parent, child, cut = topology.parent[joint], topology.child[joint], joint - topology.num_bodies
-        omega = self.angular_velocity
-        on_child = self.velocity[child] + cross(omega[child], configuration.child_arm[joint])
-        arm = configuration.parent_arm[joint] + configuration.separation[cut]
+        topology = self.system.topology
+        return self.v[topology.speeds[name]] if name in topology.speeds else self.cut_speeds([name])[0]
+
+    def cut_speeds(self, names: Sequence[str]) -> Float[Array, "k n"]:
+        """Speeds of cut joints of one type [rad/s or m/s]."""
+        topology, configuration, omega = self.system.topology, self.configuration, self.angular_velocity
+        joints = np.array([topology.joints.index(name) for name in names])
+        parent, child = np.array(topology.parent)[joints], np.array(topology.child)[joints]
+        on_child = self.velocity[child] + cross(omega[child], configuration.child_arm[joints])
+        arm = configuration.parent_arm[joints] + configuration.separation[joints - topology.num_bodies]
         seen = on_child - self.velocity[parent] - cross(omega[parent], arm)
-        angular, linear = configuration.cut_subspace(name)
-        return angular @ (omega[child] - omega[parent]) + linear @ seen
+        angular, linear = configuration.cut_subspace(names)
+        return dot(angular, (omega[child] - omega[parent])[:, None]) + dot(linear, seen[:, None])
 
     def joint_rate(self, term: Term) -> Float[Array, ""]:
         """One speed of a joint [rad/s or m/s]."""
@@ -82,7 +85,7 @@ class Motion(eqx.Module):
             return none._replace(joint_force=none.joint_force.at[topology.column(term)].set(force))
         joint = topology.joints.index(term.joint)
         parent, child, cut = topology.parent[joint], topology.child[joint], joint - topology.num_bodies
-        angular, linear = (columns[term.index or 0] * force for columns in configuration.cut_subspace(term.joint))
+        angular, linear = (columns[0, term.index or 0] * force for columns in configuration.cut_subspace([term.joint]))
         on_parent = configuration.parent_arm[joint] + configuration.separation[cut]
         load = configuration.wrench(child, configuration.child_arm[joint], linear, angular)
         return load.plus(configuration.wrench(parent, on_parent, -linear, -angular))
@@ -122,17 +125,14 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
     omega = along_path(system, edge_turn)
     edge_angular_bias = cross(omega[parent], edge_turn)
     turned, slid = _subspace_bias(configuration, v)
-    if turned is not None:
-        edge_angular_bias = edge_angular_bias + sign * turned
+    edge_angular_bias = edge_angular_bias + sign * turned
     alpha = along_path(system, edge_angular_bias)
 
     parent_rate, child_rate = cross(omega[parent], parent_arm), cross(omega[child], child_arm)
     edge_rate = sign * (parent_rate - child_rate) + edge_slide
     parent_bias = cross(alpha[parent], parent_arm) + cross(omega[parent], parent_rate)
     child_bias = cross(alpha[child], child_arm) + cross(omega[child], child_rate)
-    edge_bias = sign * (parent_bias - child_bias) + 2.0 * cross(omega[parent], edge_slide)
-    if slid is not None:
-        edge_bias = edge_bias + sign * slid
+    edge_bias = sign * (parent_bias - child_bias + slid) + 2.0 * cross(omega[parent], edge_slide)
     return Motion(
         configuration=configuration,
         v=v,
@@ -150,26 +150,20 @@ def move(configuration: Configuration, v: Float[Array, " n_v"]) -> Motion:
 def _subspace_bias(configuration, v):
     """Accelerations of the joints' children by motion subspaces that change with coordinates, Ṡ v, (n_b, 3) each.
 
-    **Returns:** angular and linear ones, seen from the parent, in ground axes; None where there are none.
+    **Returns:** angular and linear ones, seen from the parent, in ground axes.
     """
     system, topology = configuration.system, configuration.system.topology
-    angular, linear = {}, {}
+    turned = slid = jnp.zeros((topology.num_bodies, 3), v.dtype)
     speeds = lambda kind: v[np.stack([topology.columns(body) for body in kind.bodies])]
     read = lambda kind: (configuration.q[kind.coordinates], speeds(kind))
     turning = [kind for kind in topology.joint_groups if getattr(kind.motion, "angular_subspace_at", None) is not None]
     found = [(kind, (jax.vmap(partial(_turning, kind.motion))(*read(kind)),)) for kind in turning]
-    for kind, accelerations in (*found, *over_bending(_bending, system, read)):
-        for parts, part in zip((angular, linear), accelerations, strict=False):
-            parts[kind.bodies] = rotate(configuration.joint_axes[np.array(kind.bodies)], part)
-    return _scattered(topology, angular), _scattered(topology, linear)
-
-
-def _scattered(topology, parts):
-    """Put values (n, 3) of bodies into (n_b, 3); None for none."""
-    if not parts:
-        return None
-    members, values = np.concatenate([np.array(bodies) for bodies in parts]), jnp.concatenate([*parts.values()])
-    return scatter_static(jnp.zeros((topology.num_bodies, 3), values.dtype), members, values)
+    for kind, (turn, *slides) in (*found, *over_bending(_bending, system, read)):
+        axes = configuration.joint_axes[np.array(kind.bodies)]
+        turned = scatter_static(turned, kind.bodies, rotate(axes, turn))
+        for acceleration in slides:
+            slid = scatter_static(slid, kind.bodies, rotate(axes, acceleration))
+    return turned, slid
 
 
 def _turning(kind, coordinates, speeds):

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Bool
 
 from linkax.equations.configuration import configure
@@ -15,23 +16,24 @@ from linkax.equations.system import system_of
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number
-from linkax.simulation.start.branch_speeds import other_speeds, speeds_on_branch
+from linkax.simulation.start.branch_speeds import other_speeds, smallest_speeds, speeds_again, speeds_on_branch
 from linkax.simulation.start.closing import CLOSED, LoopClosure, close_loops
 from linkax.simulation.start.initial_state import ON_BRANCH, moving_joints
+from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import beams_of, rank_tolerance
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import (
     JointNumbers,
-    JointValues,
-    by_joint,
     check_mechanism,
     checked_time,
     coordinates_by_joint,
     sound_numbers,
+    speeds_by_joint,
 )
 from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program, all_concrete
+from linkax.xla.static_scatter import scatter_static
+from linkax.xla.tracing import Program, all_concrete, jit_inline, without_derivatives
 
 
 class AssemblyError(ValueError):
@@ -83,13 +85,13 @@ def assemble(
     check_mechanism(mechanism)
     t = jnp.asarray(checked_time(t, "t"))
     held, begin = (coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess")))
-    moving = by_joint(mechanism, speeds, "speed", lambda joint: len(joint.speed_units))
-    for name, _ in begin.terms:
+    moving = speeds_by_joint(mechanism, speeds, "speed")
+    for (name, _), _ in begin.by_term():
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
-    state, remainder = _assemble(mechanism, KnownEntries.of(mechanism), held, moving, begin, t)
+    state, remainder = _assembled(mechanism, KnownEntries.of(mechanism), held, moving, begin, t)
     if not all_concrete((state, remainder)):
-        return State(state.q, jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf))
+        return _marked(mechanism, state, remainder)
     remainder = jax.tree.map(np.asarray, remainder)
     _raise_if_open(mechanism, state, t, remainder)
     for beam, (strain, energy) in remainder.strained.items():
@@ -121,7 +123,7 @@ def _open_speeds(mechanism, speeds, t, state):
 
 def _raise_if_open(mechanism, state, t, remainder):
     topology = mechanism.topology
-    held = ", ".join(repr(along.joint) for along in remainder.positions.terms) or "none"
+    held = ", ".join(repr(along.joint) for along, _ in remainder.positions.by_term()) or "none"
     remains = lambda size, unit: f"a gap of {size:.6g} {unit} remains (positions held: {held})"
     advice = "check lengths and offsets, hold fewer positions, or give another guess"
     gap, scaled = remainder.gap, remainder.gap_in_scales
@@ -137,7 +139,7 @@ def _raise_if_open(mechanism, state, t, remainder):
                 f"{remains(size, 'rad or m')}; {advice}"
             )
     for what, misses in (("position", remainder.positions), ("speed", remainder.speeds)):
-        for along, miss in zip(misses.terms, misses.values, strict=True):
+        for along, miss in misses.by_term():
             if not np.all(np.abs(miss) <= remainder.most):
                 size = np.max(np.abs(miss))
                 raise AssemblyError(
@@ -172,38 +174,71 @@ class _Remainder(eqx.Module):
 
     def is_met(self) -> Bool[Array, ""]:
         """Whether the loops are closed and all that is held is met."""
-        missed = [*self.positions.values, *self.speeds.values]
-        held = jnp.array([jnp.all(jnp.abs(miss) <= self.most) for miss in missed], dtype=bool).all()
-        return held & (self.gap_in_scales.widest() <= CLOSED)
+        missed = jnp.concatenate([self.positions.flat(), self.speeds.flat()])
+        return jnp.all(jnp.abs(missed) <= self.most) & (self.gap_in_scales.widest() <= CLOSED)
+
+
+@jit_inline
+def _marked(mechanism, state, remainder):
+    """The state, with infinite speeds where it is none."""
+    return State(state.q, jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf))
+
+
+def _assembled(*given):
+    """The state and what stays open; branches of the motion are looked for only where there are some."""
+    near = without_derivatives(given)
+    if not all_concrete(near):
+        return _assemble(*given, branches=True)
+    state, remainder = _assemble(*near, branches=False)
+    if branches := bool(remainder.undecided):
+        state, remainder = _assemble(*near, branches=True)
+    return (state if all_concrete(given) else _assembled_again(given, state.q, branches)), remainder
 
 
 @Program
-def _assemble(mechanism, known, positions, speeds, guess, t):
-    system = system_of(mechanism, jnp.result_type(float), known=known)
-    topology = system.topology
-    q = jnp.asarray(neutral(topology, system.dtype))
-    for given in (guess, positions):
-        for along, entry in zip(given.terms, given.values, strict=True):
-            if along.joint in topology.coordinates:
-                q = q.at[topology.coordinate_slice(along)].set(entry)
-    demand = LoopClosure(system, t, positions)
-    begin = on_manifold(topology, q)
-    q = close_loops(demand, begin)
-    off = jnp.abs(demand.back(q, begin))
-    configuration = configure(system, t, q)
-    v, misses, off_branch, undecided = speeds_on_branch(configuration, speeds)
-    gap = gaps(configuration)
+def _assemble(mechanism, known, positions, speeds, guess, t, *, branches):
+    demand, begin = _demand(mechanism, known, positions, guess, t)
+    q = close_loops(demand, begin, None)
+    system, configuration = demand.system, configure(demand.system, t, q)
+    found = (speeds_on_branch if branches else smallest_speeds)(configuration, speeds)
+    # All else only decides, and has no derivative.
+    demand, begin, end, configuration = jax.tree.map(lax.stop_gradient, (demand, begin, q, configuration))
+    off, gap = jnp.abs(demand.back(end, begin)), gaps(configuration)
     remainder = _Remainder(
         gap=gap,
         gap_in_scales=gap.in_scales(system),
         most=CLOSED * jnp.maximum(system.length, 1.0),
-        positions=JointValues(positions.terms, demand.misses(configuration)),
-        speeds=misses,
-        off_branch=off_branch,
-        undecided=undecided,
+        positions=demand.held.apart(configuration),
+        speeds=found.misses,
+        off_branch=found.off_branch,
+        undecided=found.undecided,
         strained={
-            beam.beam: (jnp.max(off[topology.speeds[beam.beam]]), beam.energy(q[topology.coordinates[beam.beam]]))
-            for beam in beams_of(system)
+            beam.beam: (
+                jnp.max(off[system.topology.speeds[beam.beam]]),
+                beam.energy(end[system.topology.coordinates[beam.beam]]),
+            )
+            for beam in beams_of(demand.system)
         },
     )
-    return State(q, v), remainder
+    return State(q, found.v), remainder
+
+
+@jit_inline
+def _assembled_again(given, q, branches):
+    """The state whose coordinates are known, for its derivatives."""
+    mechanism, known, positions, speeds, guess, t = given
+    demand, begin = _demand(mechanism, known, positions, guess, t)
+    q = close_loops(demand, begin, q)
+    return State(q, speeds_again(configure(demand.system, t, q), speeds, branches))
+
+
+def _demand(mechanism, known, positions, guess, t):
+    """The problem of closing the loops, and the coordinates where the search begins."""
+    system = system_of(mechanism, jnp.result_type(float), known=known)
+    topology = system.topology
+    q = jnp.asarray(neutral(topology, system.dtype))
+    for given in (guess, positions):
+        for alike, rows in zip(given.groups, given.values, strict=True):
+            if alike.in_tree:
+                q = scatter_static(q, alike.in_q(topology), rows)
+    return LoopClosure(system, t, positions), on_manifold(topology, q)

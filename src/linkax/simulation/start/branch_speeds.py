@@ -1,6 +1,7 @@
 """Speeds that the loops allow, with some of them held; in a singular configuration on a branch of the motion."""
 
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,9 +19,8 @@ from linkax.linalg.saddle_inverse import invert
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.initial_state import ON_BRANCH
-from linkax.simulation.start.joint_slopes import joint_slopes
+from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
-from linkax.simulation.start.validation import JointValues
 from linkax.spatial.vectors import largest
 from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
@@ -58,6 +58,10 @@ class _Asked(eqx.Module):
         """The speeds nearest to v that satisfy the rows, on a branch or not."""
         return nearest_solution(self.system, v, self.rows, self.right, tolerance)
 
+    def smallest(self) -> Float[Array, " n_v"]:
+        """The smallest speeds that satisfy the rows."""
+        return self.next_to(jnp.zeros_like(self.system.scales))
+
     def missed(self, v: Float[Array, " n_v"]) -> Float[Array, ""]:
         """The largest miss of the rows."""
         return largest(self.right - self.rows @ v)
@@ -73,7 +77,7 @@ class _Asked(eqx.Module):
 
         Also whether other branches may cross there, between which the position does not decide.
         """
-        least, scales = self.next_to(jnp.zeros_like(self.system.scales)), self.system.scales
+        least, scales = self.smallest(), self.system.scales
         within = self.next_to(jnp.zeros_like(scales), SEEN_ULPS * jnp.finfo(scales.dtype).eps)
         off = jax.vmap(self.off_branch)(jnp.stack([within, self.aside(1)[0]]))
         told = (self.missed(within) <= CLOSED) & (off[0] <= BESIDE)
@@ -114,34 +118,67 @@ def _on_branch_jvp(primals, tangents):
 def _asked(configuration, held):
     system = configuration.system
     split = ConstraintSplit.of(configuration, rank_tolerance(system.dtype))
-    right = jnp.concatenate([rate(system, configuration.t), *held.values])
+    right = jnp.concatenate([rate(system, configuration.t), held.flat()])
     scale = lax.stop_gradient(positive_or_one(largest(right)))
     of_held = lambda v: held.speeds(move(configuration, v))
-    rows = jnp.concatenate([split.jacobian, *joint_slopes(of_held, system.topology, held.terms, system.dtype)])
+    rows = jnp.concatenate([split.jacobian, held.slopes(of_held, system.topology, system.dtype)])
     return _Asked(split, rows, right / scale, scale)
 
 
+class FoundSpeeds(NamedTuple):
+    """Speeds that the loops allow, with those of some joints held. Only `v` has derivatives.
+
+    - `v`: speeds, (n_v,). `misses`: how far the smallest speeds that the loops allow are from those held, by joint.
+    - `off_branch`: how far v are from a branch, relative to themselves. `undecided`: whether branches may cross.
+    """
+
+    v: Float[Array, " n_v"]
+    misses: JointValues
+    off_branch: Float[Array, ""]
+    undecided: Bool[Array, ""]
+
+
 @partial(straight_line, most=MOST_AT_ONCE)
-def speeds_on_branch(
-    configuration: Configuration, held: JointValues
-) -> tuple[Float[Array, " n_v"], JointValues, Float[Array, ""], Bool[Array, ""]]:
+def smallest_speeds(configuration: Configuration, held: JointValues) -> FoundSpeeds:
+    """Find the smallest speeds with those of some joints held: where the rank of J is constant, all lie on a branch."""
+    asked = _asked(configuration, held)
+    v = asked.smallest()
+    off = jax.vmap(asked.off_branch)(jnp.stack([v, asked.aside(1)[0]]))
+    on_branch = (jnp.max(off) <= ON_BRANCH * rank_tolerance(v.dtype)) & (asked.missed(v) <= CLOSED)
+    return _found(asked, held, v, v, off[0], (largest(asked.right) > 0.0) & jnp.logical_not(on_branch))
+
+
+@partial(straight_line, most=MOST_AT_ONCE)
+def speeds_on_branch(configuration: Configuration, held: JointValues) -> FoundSpeeds:
     """Find the smallest speeds with those of some joints held, or, near them, speeds on a branch of the motion.
 
     Speeds satisfy J v = b, and γ(v, v) is in the range of J; where the rank of J is constant, the
     smallest do.
-
-    **Returns:** speeds, (n_v,); how far the smallest speeds that the loops allow are from those held, by
-    joint; how far the speeds are from a branch, relative to themselves; whether there may be other branches.
     """
     asked = _asked(configuration, held)
-    split, scale = asked.split, asked.scale
     least, undecided = asked.least()
     v = _on_branch(asked, least)
+    return _found(asked, held, least, v, asked.off_branch(v), undecided)
+
+
+@straight_line
+def speeds_again(configuration: Configuration, held: JointValues, branches: bool) -> Float[Array, " n_v"]:
+    """Find the same speeds again, (n_v,), for their derivatives."""
+    if branches:
+        return speeds_on_branch(configuration, held).v
+    asked = _asked(configuration, held)
+    return asked.scale * asked.smallest()
+
+
+def _found(asked, held, least, v, off_branch, undecided):
+    given = asked.scale * v
+    asked, least, v, off_branch = lax.stop_gradient((asked, least, v, off_branch))
     # What the loops leave of them: a row that is nearly none opens little, and yet may allow no motion at all.
+    split, scale = asked.split, asked.scale
     opened = split.jacobian @ least - asked.right[: split.jacobian.shape[0]]
-    reached = held.speeds(move(configuration, scale * (least - split.inverse.normal @ opened)))
-    misses = JointValues(held.terms, tuple(found - entry for found, entry in zip(reached, held.values, strict=True)))
-    return scale * v, misses, jnp.maximum(asked.off_branch(v), asked.missed(v)), undecided
+    reached = held.speeds(move(split.configuration, scale * (least - split.inverse.normal @ opened)))
+    misses = jax.tree.map(jnp.subtract, reached, held)
+    return FoundSpeeds(given, misses, jnp.maximum(off_branch, asked.missed(v)), undecided)
 
 
 @Program

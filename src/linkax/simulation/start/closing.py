@@ -13,11 +13,8 @@ from linkax.equations.gaps import as_if_closed, flips
 from linkax.equations.loops import jacobian, residual
 from linkax.equations.system import System
 from linkax.linalg.while_falling import while_falling
-from linkax.model.terms import Term
-from linkax.simulation.start.joint_slopes import joint_slopes
+from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import elastic_energy, nearest_solution, nearest_solution_in, strains_of
-from linkax.simulation.start.validation import JointValues
-from linkax.spatial.quaternions import conjugate, multiply, rotation_vector
 from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import pushforward, ratio
@@ -41,35 +38,20 @@ class LoopClosure(eqx.Module):
     t: Array
     held: JointValues
 
-    def misses(self, configuration: Configuration) -> tuple[Float[Array, " _"], ...]:
-        """How far joints are from where they are held, one number for each speed, by joint."""
-        topology, apart = self.system.topology, []
-        for along, entry in zip(self.held.terms, self.held.values, strict=True):
-            kind = topology.joint_types[topology.joints.index(along.joint)]
-            turning = 3 * kind.has_quaternion
-            indices = range(turning, len(kind.speed_units)) if along.index is None else [along.index]
-            ends = entry[turning + kind.has_quaternion :] if along.index is None else entry
-            away = lambda index, end, name=along.joint: configuration.joint_displacement(Term(name, index), end)
-            missed = [away(index, end) for index, end in zip(indices, ends, strict=True)]
-            missed = [jnp.stack(missed)] if missed else []
-            if kind.has_quaternion and along.index is None:
-                found = configuration.joint_coordinates(along.joint)[:4]
-                missed.insert(0, rotation_vector(multiply(found, conjugate(entry[:4] / jnp.linalg.norm(entry[:4])))))
-            apart.append(jnp.concatenate([jnp.zeros(0, self.system.dtype), *missed]))
-        return tuple(apart)
-
     def rows(self, configuration: Configuration) -> Float[Array, " n"]:
         """All residuals: loop rows, flipped axes, misses."""
-        return jnp.concatenate([residual(configuration), flips(configuration)[0], *self.misses(configuration)])
+        return jnp.concatenate(
+            [residual(configuration), flips(configuration)[0], self.held.apart(configuration).flat()]
+        )
 
     @straight_line
     def linearised(self, q: Float[Array, " n_q"]) -> tuple[Float[Array, " n"], Float[Array, "n n_v"]]:
         """The residuals and their derivative where the loops are closed; elsewhere the direction that closes them."""
         topology, configuration = self.system.topology, configure(self.system, self.t, q)
         moved = lambda change: configure(self.system, self.t, retract(topology, q, change))
-        held = joint_slopes(lambda change: self.misses(moved(change)), topology, self.held.terms, q.dtype)
+        held = self.held.slopes(lambda change: self.held.apart(moved(change)), topology, q.dtype)
         close_loops = as_if_closed(configuration)
-        return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], *held])
+        return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], held])
 
     @straight_line
     def size(self, q: Float[Array, " n_q"]) -> Float[Array, ""]:
@@ -188,18 +170,20 @@ def _size(rows):
 
 
 @eqx.filter_custom_jvp
-def close_loops(demand: LoopClosure, q: Float[Array, " n_q"]) -> Float[Array, " n_q"]:
-    """Find coordinates that close the loops, by a search from q."""
-    return demand.search(q)
+def close_loops(
+    demand: LoopClosure, q: Float[Array, " n_q"], found: Float[Array, " n_q"] | None
+) -> Float[Array, " n_q"]:
+    """Find coordinates that close the loops, by a search from q, or take what such a search has `found`."""
+    return demand.search(q) if found is None else found
 
 
 @close_loops.def_jvp
 def _closed_jvp(primals, tangents):
     """Tangent by the implicit function theorem, nearest to that of where the search begins; the search has none."""
-    demand, begin = primals
-    q = close_loops(demand, begin)
+    demand, begin, _ = primals
+    q = close_loops(*primals)
     # Apart from their structure, see `linkax.formulations.projected_state`.
-    return q, _closed_tangent(demand, begin, q, *jax.tree.flatten(tangents))
+    return q, _closed_tangent(demand, begin, q, *jax.tree.flatten(tangents[:2]))
 
 
 @straight_line

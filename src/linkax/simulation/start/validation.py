@@ -1,6 +1,6 @@
 """Checks of what users give for a mechanism: numbers for joints, states, times."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import reduce
 from itertools import chain
 from operator import and_
@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from linkax.equations.motion import Motion
 from linkax.model.functions import Law
-from linkax.model.joints.joint import AbstractJoint
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, Vector, is_finite, namespace, number, real, require, require_type
-from linkax.model.terms import Term, TermLike, term
+from linkax.model.terms import TermLike, term
+from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import concrete
@@ -27,22 +26,6 @@ JointNumbers = (
     Mapping[str, Number | Vector] | Mapping[tuple[str, int], Number | Vector] | Mapping[TermLike, Number | Vector]
 )
 Tree = TypeVar("Tree")
-
-
-class JointValues(eqx.Module):
-    """Numbers for joints.
-
-    - `terms`: whose they are; one number for a term with an index, else all of the joint's.
-    - `values`: as many arrays.
-    """
-
-    terms: tuple[Term, ...] = eqx.field(static=True)
-    values: tuple[Array, ...]
-
-    def speeds(self, motion: Motion) -> list[Float[Array, " _"]]:
-        """Read the speeds of these joints in a motion, in the shapes of `values`."""
-        of_joint = lambda along: motion.joint_speeds(along.joint)
-        return [of_joint(along) if along.index is None else of_joint(along)[along.index][None] for along in self.terms]
 
 
 def _is_law(node) -> bool:
@@ -141,14 +124,33 @@ def _check_quaternion(coordinates, what):
         )
 
 
-def by_joint(
-    mechanism: Mechanism, given: Mapping[Any, Any] | None, what: str, count: Callable[[AbstractJoint], int]
-) -> JointValues:
-    """Check numbers for joints, {joint or (joint, index): number or array}.
+def speeds_by_joint(mechanism: Mechanism, given: Mapping[Any, Any] | None, what: str) -> JointValues:
+    """Check speeds for joints, {joint or (joint, index): number or array}, or their rates."""
+    pairs = _by_joint(mechanism, given, what, lambda joint: len(joint.speed_units))
+    return JointValues.of(mechanism.topology, [(along, entry) for along, _, entry in pairs])
+
+
+def coordinates_by_joint(mechanism: Mechanism, given: Mapping[Any, Any] | None, what: str) -> JointValues:
+    """Check coordinates for joints likewise: quaternions whole and not zero."""
+    found = []
+    for along, joint, entry in _by_joint(mechanism, given, what, lambda joint: joint.num_coordinates):
+        if joint.has_quaternion and along.index is None:
+            entry = _check_quaternion(entry, f"{what} of joint {joint.name!r}")
+        if joint.has_quaternion and along.index in (0, 1, 2):
+            raise ValueError(
+                f"{what} of joint {joint.name!r}: index {along.index} is part of a quaternion; give all of it"
+            )
+        found.append((along, entry))
+    return JointValues.of(mechanism.topology, found)
+
+
+def _by_joint(mechanism, given, what, count):
+    """Check numbers for joints.
 
     **Arguments:** `count`: joint ↦ how many numbers it has.
+
+    **Yields:** terms, joints and arrays of their numbers.
     """
-    terms, values = [], []
     given = {} if given is None else given
     require_type(given, Mapping, what, "give {joint: number, ...}")
     for key, entry in given.items():
@@ -164,21 +166,4 @@ def by_joint(
         array = real(entry, of_joint)
         if array.shape == () and expected != 1:
             raise ValueError(f"{of_joint} is one number; the joint has {expected} of them")
-        terms.append(along)
-        values.append(number(array[None] if array.shape == () else array, (expected,), of_joint))
-    return JointValues(tuple(terms), tuple(values))
-
-
-def coordinates_by_joint(mechanism: Mechanism, given: Mapping[Any, Any] | None, what: str) -> JointValues:
-    """Check coordinates of joints: quaternions whole and not zero."""
-    found, values = by_joint(mechanism, given, what, lambda joint: joint.num_coordinates), []
-    for along, entry in zip(found.terms, found.values, strict=True):
-        joint = mechanism.joint(along.joint)
-        if joint.has_quaternion and along.index is None:
-            entry = _check_quaternion(entry, f"{what} of joint {joint.name!r}")
-        if joint.has_quaternion and along.index in (0, 1, 2):
-            raise ValueError(
-                f"{what} of joint {joint.name!r}: index {along.index} is part of a quaternion; give all of it"
-            )
-        values.append(entry)
-    return JointValues(found.terms, tuple(values))
+        yield along, joint, number(array[None] if array.shape == () else array, (expected,), of_joint)

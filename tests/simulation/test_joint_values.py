@@ -11,9 +11,7 @@ from linkax.equations.coordinates import neutral, retract
 from linkax.equations.system import system_of
 from linkax.model.terms import Term
 from linkax.scenes import SCENES
-from linkax.simulation.start.closing import LoopClosure
-from linkax.simulation.start.joint_slopes import joint_slopes
-from linkax.simulation.start.validation import JointValues
+from linkax.simulation.start.joint_values import JointValues
 
 
 def _row_of_four_bars(_seed):
@@ -33,13 +31,17 @@ def test_slopes_of_joints_are_those_along_all_speeds(make):
     moved = lambda change: configure(system, t, retract(topology, q, change))
     still = jnp.zeros(topology.num_speeds)
 
+    values = [(Term(name, None), np.asarray(moved(still).joint_coordinates(name))) for name in topology.joints]
+    held = JointValues.of(topology, values)
+
     @jax.jit
     def compared():
-        terms = tuple(Term(name, None) for name in topology.joints)
-        values = tuple(moved(still).joint_coordinates(name) for name in topology.joints)
-        misses = lambda change: LoopClosure(system, t, JointValues(terms, values)).misses(moved(change))
-        return joint_slopes(misses, topology, terms, t.dtype), jax.jacfwd(misses)(still)
+        apart = lambda change: held.apart(moved(change))
+        slopes = held.slopes(apart, topology, t.dtype)
+        return apart(still), slopes, jax.jacfwd(lambda change: apart(change).flat())(still)
 
-    for name, found, expected in zip(topology.joints, *compared(), strict=True):
-        assert found.shape == expected.shape
-        np.testing.assert_allclose(found, expected, atol=1e-13, err_msg=name)
+    at_rest, found, expected = compared()
+    np.testing.assert_allclose(found, expected, atol=1e-13)
+    assert {along for along, _ in at_rest.by_term()} == {along for along, _ in values}
+    for along, rows in at_rest.by_term():
+        np.testing.assert_allclose(rows, 0.0, atol=1e-13, err_msg=along.joint)
