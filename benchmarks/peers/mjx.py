@@ -61,6 +61,15 @@ def throughput(descriptions: list[Description], setting: Setting, duration: floa
     return len(descriptions) / seconds
 
 
+def throughput_alike(description: Description, count: int, setting: Setting, duration: float) -> float:
+    """Trajectories of a duration [s] per second, of worlds that are alike."""
+    model, start, _ = _start(description, setting)
+    starts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), start)
+    simulate = lambda steps: jax.block_until_ready(_ends_alike(model, starts, steps))
+    simulate(0)
+    return count / timed(lambda: simulate(round(duration / setting.step)))[1]
+
+
 def mass_derivative(
     description: Description, setting: Setting, duration: float, body: int
 ) -> tuple[np.ndarray, float, float]:
@@ -113,6 +122,11 @@ def _sample(model, data, every):
         return data, (data.qpos, data.qvel)
 
     return jax.lax.scan(sample, data, length=PIECE)
+
+
+@jax.jit
+def _ends_alike(model, starts, steps):
+    return jax.vmap(lambda data: _advance(model, data, steps).qpos)(starts)
 
 
 @jax.jit
