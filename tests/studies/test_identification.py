@@ -40,7 +40,7 @@ def measured(params):
     """Angle of the crank and of the rocker, (n_t, 2)."""
     mechanism = four_bar(params)
     state = lx.assemble(mechanism, {"bearing": params["angle"]}, guess={"crank_pin": -1.0, "pivot": 2.0})
-    found = lx.simulate(mechanism, state, t1=TIMES[-1], accuracy=lx.DRAFT, saveat=diffrax.SaveAt(ts=TIMES))
+    found = lx.simulate(mechanism, state, t1=TIMES[-1], accuracy=lx.Accuracy(1e-6), saveat=diffrax.SaveAt(ts=TIMES))
     return jnp.stack([found.joint("bearing"), found.joint("pivot")], axis=1)
 
 
