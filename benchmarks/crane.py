@@ -132,14 +132,7 @@ def runs(out):
         _, mechanism, state = crane(name)
         t1 = SCENE.duration(name)
         times = np.linspace(0.0, t1, 401)
-        run = lambda m=mechanism, s=state, t1=t1, times=times: jax.block_until_ready(
-            lx.simulate(m, s, t1=t1, saveat=diffrax.SaveAt(ts=times))
-        )
-        began = time.perf_counter()
-        found = run()
-        first = time.perf_counter() - began
-        run()
-        seconds = time.perf_counter() - began - first
+        found, first, seconds = _twice(mechanism, state, t1, diffrax.SaveAt(ts=times))
         violation = found.worst_violation()
         yield {
             "variant": name,
@@ -160,6 +153,16 @@ def runs(out):
         drawn.savefig(out / f"{name}.png", dpi=110)
 
 
+def _twice(mechanism, state, t1, saveat):
+    """A run, and the seconds it takes with compiling and without."""
+    run = lambda: jax.block_until_ready(lx.simulate(mechanism, state, t1=t1, saveat=saveat))
+    began = time.perf_counter()
+    run()
+    compiled = time.perf_counter()
+    found = run()
+    return found, compiled - began, time.perf_counter() - compiled
+
+
 def cost(out):
     """Seconds to run, once compiled; the exponents are between a row and the one before."""
     for what, values in (("elements", ELEMENTS), ("length_s", LENGTHS)):
@@ -167,15 +170,8 @@ def cost(out):
         for value in values:
             _, mechanism, state = crane(**{"elements": value} if what == "elements" else {})
             t1 = 1.0 if what == "elements" else value
-            run = lambda m=mechanism, s=state, t1=t1: jax.block_until_ready(
-                lx.simulate(m, s, t1=t1, saveat=diffrax.SaveAt(t1=True))
-            )
-            began = time.perf_counter()
-            run()
-            compiled = time.perf_counter()
-            steps = int(run().stats["num_steps"])
-            seconds, first = time.perf_counter() - compiled, compiled - began
-            row = {what: value, "speeds": mechanism.topology.num_speeds, "steps": steps}
+            found, first, seconds = _twice(mechanism, state, t1, diffrax.SaveAt(t1=True))
+            row = {what: value, "speeds": mechanism.topology.num_speeds, "steps": int(found.stats["num_steps"])}
             row |= {"first_run_s": f"{first:.3g}", "run_s": f"{seconds:.3g}"}
             if before is not None:
                 row["exponent"] = f"{np.log(seconds / before[1]) / np.log(value / before[0]):.2f}"

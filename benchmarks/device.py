@@ -19,16 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import linkax as lx
-from benchmarks.batches import PROBLEM, cheapest_tolerance, masses, simulated
+from benchmarks.batches import MJX, PROBLEM, cheapest_tolerance, masses, simulated
 from benchmarks.parts import print_parts
 from benchmarks.peers.kinematics import judge
-from benchmarks.peers.runs import GaveUp, Setting
+from benchmarks.peers.runs import GaveUp
 from benchmarks.problems import PROBLEMS, TIMES
+from benchmarks.straight_line import evaluate
 from linkax.equations.system import system_of
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 MOST_SECONDS = 120.0
-OF_PEERS = Setting("RK4", 1e-3)
 LOWERED = ("M1a", "M3", "M2-10")
 PLATFORMS = ("cpu", "cuda")
 
@@ -63,12 +63,12 @@ def _by_peer(name: str) -> Iterator[dict]:
         yield {"note": f"{missing.name} is not installed"}
         return
     try:
-        run = peer.run(worlds, OF_PEERS, TIMES)
+        run = peer.run(worlds, MJX, TIMES)
         error = judge(worlds, TIMES, run.coordinates, run.speeds, PROBLEM.reference())["error"]
     except GaveUp:
         pass  # a single world may take longer than thousands are worth; its error is that of `benchmarks.peers`
-    for row in _growing(lambda size: peer.throughput_alike(worlds, size, OF_PEERS, TIMES[-1])):
-        yield {"what": "run", "setting": f"{OF_PEERS.method} {OF_PEERS.step:g} s", "error": error, **row}
+    for row in _growing(lambda size: peer.throughput_alike(worlds, size, MJX, TIMES[-1])):
+        yield {"what": "run", "setting": f"{MJX.method} {MJX.step:g} s", "error": error, **row}
 
 
 def lowering() -> Iterator[dict]:
@@ -87,13 +87,9 @@ def lowering() -> Iterator[dict]:
 def _evaluation(key):
     mechanism, state = PROBLEMS[key].start()
     arrays, static = eqx.partition(system_of(mechanism, float), eqx.is_array)
-    method = lx.TangentSpace().prepared(float)
-
-    def evaluate(arrays, q, v):
-        return method.derivative(eqx.combine(arrays, static), jnp.zeros(()), q, v, True)[:3]
-
+    of_arrays = lambda arrays, q, v: evaluate(eqx.combine(arrays, static), q, v)
     batch = [jnp.tile(array, (SIZES[0], 1)) for array in (state.q, state.v)]
-    return jax.vmap(evaluate, in_axes=(None, 0, 0)), arrays, *batch
+    return jax.vmap(of_arrays, in_axes=(None, 0, 0)), arrays, *batch
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import linkax as lx
 from benchmarks.evaluation import SMALLEST, seconds_of
 from benchmarks.parts import print_parts
 from benchmarks.problems import PROBLEMS
-from linkax.equations.system import system_of
+from linkax.equations.system import System, system_of
 from linkax.straight_line.known import patterns_of
 from linkax.straight_line.transform import MOST_OPERATIONS, Traced, straight_line
 
@@ -25,13 +25,14 @@ EVALUATED = ("M1n", "M1a", "M2-1", "M3", "planar-four-bar", "FL3", "rigid-crane"
 LANES = 256
 
 
+def evaluate(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, ...]:
+    """v, v̇ and q of the equations of motion, corrected."""
+    return lx.TangentSpace().prepared(float).derivative(system, jnp.zeros(()), q, v, True)[:3]
+
+
 def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
     """Of an evaluation at a state."""
     system = system_of(mechanism, float)
-
-    def evaluate(system, q, v):
-        return lx.TangentSpace().prepared(float).derivative(system, jnp.zeros(()), q, v, True)[:3]
-
     given = system, state.q, state.v
     arrays, static = eqx.partition(given, eqx.is_array)
     function = lambda arrays: evaluate(*eqx.combine(arrays, static))

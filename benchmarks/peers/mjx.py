@@ -54,20 +54,21 @@ def throughput(descriptions: list[Description], setting: Setting, duration: floa
     """Trajectories of a duration [s] per second, of mechanisms that differ in numbers and start only."""
     models, starts, _ = zip(*(_start(description, setting) for description in descriptions), strict=True)
     models, starts = (jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees) for trees in (models, starts))
-    steps = round(duration / setting.step)
-    simulate = lambda steps: jax.block_until_ready(_ends(models, starts, steps))
-    simulate(0)
-    _, seconds = timed(lambda: simulate(steps))
-    return len(descriptions) / seconds
+    return _rate(_ends, models, starts, len(descriptions), round(duration / setting.step))
 
 
 def throughput_alike(description: Description, count: int, setting: Setting, duration: float) -> float:
     """Trajectories of a duration [s] per second, of worlds that are alike."""
     model, start, _ = _start(description, setting)
     starts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), start)
-    simulate = lambda steps: jax.block_until_ready(_ends_alike(model, starts, steps))
+    return _rate(_ends_alike, model, starts, count, round(duration / setting.step))
+
+
+def _rate(ends, models, starts, count, steps):
+    """Trajectories of so many steps per second."""
+    simulate = lambda steps: jax.block_until_ready(ends(models, starts, steps))
     simulate(0)
-    return count / timed(lambda: simulate(round(duration / setting.step)))[1]
+    return count / timed(lambda: simulate(steps))[1]
 
 
 def mass_derivative(
@@ -124,11 +125,9 @@ def _sample(model, data, every):
     return jax.lax.scan(sample, data, length=PIECE)
 
 
-@jax.jit
-def _ends_alike(model, starts, steps):
-    return jax.vmap(lambda data: _advance(model, data, steps).qpos)(starts)
+def _end(model, start, steps):
+    return _advance(model, start, steps).qpos
 
 
-@jax.jit
-def _ends(models, starts, steps):
-    return jax.vmap(lambda model, data: _advance(model, data, steps).qpos)(models, starts)
+_ends = jax.jit(jax.vmap(_end, in_axes=(0, 0, None)))
+_ends_alike = jax.jit(jax.vmap(_end, in_axes=(None, 0, None)))

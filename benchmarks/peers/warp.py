@@ -9,14 +9,7 @@ from benchmarks.peers.description import Description
 from benchmarks.peers.mjcf import model_of, places
 from benchmarks.peers.runs import Deadline, Run, Setting, steps_between, timed
 
-METHODS = ("RK4", "implicitfast", "Euler")  # integrators
-STEPS = (5e-3, 2e-3, 1e-3)  # shorter ones lose more to rounding than they gain
 DECAY_STEPS = 2.0  # time in which gaps of loops decay
-
-
-def settings() -> list[Setting]:
-    """From coarse to fine, method by method."""
-    return [Setting(method, step) for method in METHODS for step in STEPS]
 
 
 def run(description: Description, setting: Setting, times) -> Run:
