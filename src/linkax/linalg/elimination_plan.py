@@ -14,7 +14,7 @@ from jaxtyping import Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-PER_FRONT = 500.0  # products that take as long as what a front costs however small it is
+PER_FRONT = 100.0  # products that take as long as what a front costs however small it is
 
 
 @dataclasses.dataclass(frozen=True)
