@@ -31,7 +31,7 @@ class KnownEntries:
     @staticmethod
     def of(tree: Any) -> "KnownEntries":
         """Those of vectors and matrices of real numbers that are not traced, or are remembered."""
-        return KnownEntries(tuple(_pattern(known_values(array)) for array in _arrays(tree)))
+        return KnownEntries(_patterns([known_values(array) for array in _arrays(tree)]))
 
     def through(self, function: Callable[..., Any], tree: Any, *details: Any) -> "KnownEntries":
         """Those of the arrays that `function(tree, *details)` makes of a pytree with these; kept for each function."""
@@ -53,14 +53,14 @@ def _through(function, details, structure, shapes, of_fixed, fixed, known):
     program = straighten(traced, known.patterns, None)
     graph = program.graph
 
-    def pattern(entries):
+    def values(entries):
         indices = entries.ravel().tolist()
         if any(graph.dtypes[index].kind != "f" for index in indices):
             return None
-        values = [np.nan if (value := graph.values[index]) is None else float(value) for index in indices]
-        return _pattern(np.reshape(values, entries.shape), ones=True)
+        known = [np.nan if (value := graph.values[index]) is None else float(value) for index in indices]
+        return np.reshape(known, entries.shape)
 
-    return KnownEntries(tuple(map(pattern, program.outputs)))
+    return KnownEntries(_patterns([*map(values, program.outputs)], ones=True))
 
 
 _remembered: dict[int, np.ndarray] = {}  # of traced arrays that are alive, by their identity
@@ -97,13 +97,21 @@ def patterns_of(tree: Any) -> list[Pattern | None]:
 
 
 def _arrays(tree):
-    return jax.tree.leaves(eqx.filter(tree, eqx.is_array))
+    return [*filter(eqx.is_array, jax.tree.leaves(tree))]
 
 
-def _pattern(array, ones=None) -> Pattern | None:
-    if array is None or array.ndim == 0 or array.dtype.kind != "f":
-        return None
-    ones = array.ndim > 1 if ones is None else ones
-    known = (array == 0.0) | (ones & (np.abs(array) == 1.0))
+def _patterns(arrays, ones=None) -> tuple[Pattern | None, ...]:
+    """Of each array; all at once, as a call of NumPy takes longer than their few numbers."""
+    read = [array for array in arrays if array is not None and array.ndim > 0 and array.dtype.kind == "f"]
+    ends = np.cumsum([0, *(array.size for array in read)])
+    may_be_one = np.repeat([array.ndim > 1 if ones is None else ones for array in read], np.diff(ends))
+    numbers = np.concatenate([np.zeros(0), *map(np.ravel, read)])
+    known = (numbers == 0.0) | (may_be_one.astype(bool) & (np.abs(numbers) == 1.0))
     # A zero with a sign is a zero.
-    return (array.shape, np.where(known, array + 0.0, np.nan).astype(float).tobytes()) if np.any(known) else None
+    values, counts = np.where(known, numbers + 0.0, np.nan), np.cumsum(np.concatenate([[0], known]))[ends]
+    found = {
+        id(array): (array.shape, values[first:last].tobytes())
+        for array, first, last, less, more in zip(read, ends, ends[1:], counts, counts[1:], strict=False)
+        if more > less
+    }
+    return tuple(found.get(id(array)) for array in arrays)

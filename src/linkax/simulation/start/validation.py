@@ -64,9 +64,11 @@ def sound_numbers(mechanism: Mechanism) -> Bool[Array, ""] | np.bool_:
     """
     places = (mechanism.bodies, mechanism.beams, mechanism.joints, mechanism.forces, mechanism.constraints)
     own = [element for element in chain(*places) if type(element).__module__.startswith("linkax.")]
-    leaves = jax.tree.leaves(own, is_leaf=_is_law)
-    # An array of NumPy was known when the mechanism was built, and checked there.
-    return reduce(and_, map(is_finite, filter(eqx.is_array, leaves)), np.True_)
+    arrays = [*filter(eqx.is_array, jax.tree.leaves(own, is_leaf=_is_law))]
+    traced = [array for array in arrays if concrete(array) is None]
+    # At once: a call of NumPy takes longer than their few numbers.
+    known = np.concatenate([np.zeros(0), *(np.ravel(array) for array in arrays if concrete(array) is not None)])
+    return reduce(and_, map(is_finite, traced), is_finite(known))
 
 
 def marked(mechanism: Mechanism, found: Tree) -> Tree:
