@@ -197,3 +197,13 @@ def test_inverse_dynamics_undoes_the_dynamics():
     assert np.linalg.norm(here.acceleration("slider")[0] - slider) > 1.0
     with pytest.raises(ValueError, match=r"acceleration asked of joint '(bearing|guide)' is missed by"):
         lx.inverse_dynamics(mechanism, state, {"bearing": 3.0, "guide": 100.0})
+    with pytest.raises(ValueError, match=r"joint 'bearing' is given twice, again by \('bearing', None\)"):
+        lx.inverse_dynamics(mechanism, state, {"bearing": 3.0, ("bearing", None): 3.0})
+
+
+def test_inverse_dynamics_is_in_the_precision_of_the_state():
+    mechanism, state = start("crank-slider", "SC3", {"angle": 0.4})
+    single = jax.tree.map(lambda array: array.astype(jnp.float32), state)
+    found, exact = (lx.inverse_dynamics(mechanism, given, {"bearing": 3.3}) for given in (single, state))
+    assert found.acceleration.dtype == found.forces["bearing"].dtype == jnp.float32
+    np.testing.assert_allclose(found.forces["bearing"], exact.forces["bearing"], rtol=1e-4)

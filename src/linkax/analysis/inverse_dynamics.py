@@ -21,6 +21,7 @@ from linkax.linalg.saddle_inverse import invert
 from linkax.model.mechanism import Mechanism
 from linkax.model.terms import term
 from linkax.simulation.explain.diagnosis import massless_bodies
+from linkax.simulation.integrate.run import cast
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked, speeds_by_joint
 from linkax.xla.arrays import Array
@@ -29,6 +30,7 @@ from linkax.xla.tracing import Program, concrete
 JointKey = str | tuple[str, int]
 Accelerations = Mapping[JointKey, ArrayLike | Sequence[float]]
 MET = 1e-9  # error up to which an acceleration counts as reached, relative to the largest
+MET_ULPS = 1e3  # the same, in single precision
 
 
 class InverseDynamics(NamedTuple):
@@ -68,7 +70,8 @@ def inverse_dynamics(
     wanted = speeds_by_joint(mechanism, accelerations, "acceleration")
     if not wanted.groups:
         raise ValueError("inverse_dynamics needs accelerations; give {joint: acceleration, ...}")
-    acceleration, forces, misses = _inverse_dynamics(mechanism, state, wanted, t)
+    given = cast((mechanism, state, wanted, t), state.q.dtype)
+    acceleration, forces, misses = _inverse_dynamics(*given)
     if concrete(acceleration) is not None:
         if not np.all(np.isfinite(acceleration)):
             system = system_of(mechanism, state.q.dtype)
@@ -77,9 +80,10 @@ def inverse_dynamics(
                 "accelerations are not finite; give mass and inertia to bodies that move without, "
                 f"{', '.join(map(repr, massless)) or 'none here'}, and finite numbers to forces"
             )
-        scale = max(1.0, float(np.max(np.abs(wanted.flat()), initial=0.0)))
+        largest = max(1.0, float(np.max(np.abs(wanted.flat()), initial=0.0)))
+        most = largest * max(MET, MET_ULPS * float(jnp.finfo(acceleration.dtype).eps))
         for along, miss in misses.by_term():
-            if not np.max(np.abs(miss), initial=0.0) <= MET * scale:
+            if not np.max(np.abs(miss), initial=0.0) <= most:
                 size = np.max(np.abs(miss))
                 raise ValueError(
                     f"the acceleration asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not allow "

@@ -94,7 +94,7 @@ class JointValues(eqx.Module):
 
     def flat(self) -> Float[Array, " _"]:
         """All numbers."""
-        return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, self.values)])
+        return jnp.concatenate([*map(jnp.ravel, self.values)] or [jnp.zeros(0)])
 
     def filled(self, numbers: Float[Array, " _"]) -> "JointValues":
         """Other numbers for the same terms, in the order of `flat`."""

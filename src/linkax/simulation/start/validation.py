@@ -153,10 +153,13 @@ def _by_joint(mechanism, given, what, count):
 
     **Yields:** terms, joints and arrays of their numbers.
     """
-    given = {} if given is None else given
+    given, seen = {} if given is None else given, set()
     require_type(given, Mapping, what, "give {joint: number, ...}")
     for key, entry in given.items():
         along = term(key, what)
+        if along in seen:
+            raise ValueError(f"{what} of joint {along.joint!r} is given twice, again by {key!r}; give it once")
+        seen.add(along)
         joint = mechanism.joint(along.joint)
         expected = count(joint) if along.index is None else 1
         if along.index is not None and not 0 <= along.index < len(joint.speed_units):
