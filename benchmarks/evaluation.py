@@ -61,6 +61,7 @@ def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
 def seconds_of(run):
     """Of one evaluation, the shortest of several loops over as many as take long enough."""
     count = 1
+    jax.block_until_ready(run(count))  # the first call takes longer
     while True:
         began = time.perf_counter()
         jax.block_until_ready(run(count))
