@@ -30,7 +30,7 @@ from linkax.xla.tracing import Program, concrete
 JointKey = str | tuple[str, int]
 Accelerations = Mapping[JointKey, ArrayLike | Sequence[float]]
 MET = 1e-9  # error up to which an acceleration counts as reached, relative to the largest
-MET_ULPS = 1e3  # the same, in single precision
+MET_ULPS = 1e3  # the same in units of rounding, which is more in single precision
 
 
 class InverseDynamics(NamedTuple):

@@ -57,8 +57,8 @@ def _through(function, details, structure, shapes, of_fixed, fixed, known):
         indices = entries.ravel().tolist()
         if any(graph.dtypes[index].kind != "f" for index in indices):
             return None
-        known = [np.nan if (value := graph.values[index]) is None else float(value) for index in indices]
-        return np.reshape(known, entries.shape)
+        found = [np.nan if (value := graph.values[index]) is None else float(value) for index in indices]
+        return np.reshape(found, entries.shape)
 
     return KnownEntries(_patterns([*map(values, program.outputs)], ones=True))
 
