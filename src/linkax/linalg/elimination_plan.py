@@ -131,7 +131,8 @@ def _largest(sets, size):
 
 def _levels(sets, size):
     """The number of sets between each speed and an end of its part, (n,); parts one after the other."""
-    members = np.array([(index, speed) for index, together in enumerate(sets) for speed in together]).reshape(-1, 2)
+    members = [(index, speed) for index, together in enumerate(sets) for speed in together]
+    members = np.array(members, dtype=np.int32).reshape(-1, 2)  # SciPy 1.14 finds shortest paths by no other integers
     incidence = csr_array((np.ones(len(members)), members.T), shape=(len(sets), size))
     graph, levels = (incidence.T @ incidence).tocsr(), np.zeros(size, dtype=int)
     count, part = connected_components(graph, directed=False)
