@@ -9,7 +9,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, require_bool
 from linkax.simulation.explain.diagnosis import cause
-from linkax.simulation.explain.remarks import in_words
+from linkax.simulation.explain.remarks import in_words, remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
 from linkax.simulation.integrate.integrate import integrate_run
 from linkax.simulation.integrate.results import ENDED_WELL, RESULTS, WARNINGS, SimulationError, remark_name, result_name
@@ -106,8 +106,8 @@ def simulate(
         if result_name(solution.result) not in ENDED_WELL:
             if throw:
                 raise _failure(solution)
-        elif (remark := remark_name(solution.remark())) != "none":
-            warnings.warn(in_words(solution, remark).lstrip(), WARNINGS[remark], stacklevel=2)
+        elif (found := remark_name(remark(solution))) != "none":
+            warnings.warn(in_words(solution, found).lstrip(), WARNINGS[found], stacklevel=2)
     return solution
 
 

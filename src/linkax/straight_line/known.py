@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,8 +17,10 @@ import numpy as np
 
 from linkax.straight_line.program import Pattern, straighten
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import concrete
+from linkax.xla.flat import Flat
+from linkax.xla.tracing import all_concrete, concrete
 
+Tree = TypeVar("Tree")
 MOST_KEPT = 256  # of what functions make of known entries
 
 
@@ -78,6 +80,20 @@ def known_values(array: Any) -> np.ndarray | None:
     """The values of an array, NaN where they are not known; None where none is."""
     known = concrete(array)
     return _remembered.get(id(array)) if known is None else known
+
+
+_flat: dict[int, Flat] = {}  # of trees that are alive, by their identity
+
+
+def flat_with_known(tree: Tree) -> Flat[Tree]:
+    """A tree whose `noted` is what is known of its arrays; kept while it lives where none is traced."""
+    if id(tree) in _flat:
+        return _flat[id(tree)]
+    flat = Flat.of(tree, KnownEntries.of(tree))
+    if all_concrete(flat):
+        _flat[id(tree)] = flat
+        weakref.finalize(tree, _flat.pop, id(tree))
+    return flat
 
 
 class KnowsEntries(eqx.Module):

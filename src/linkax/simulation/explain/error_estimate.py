@@ -52,8 +52,8 @@ def part_of_run(solution: Solution, state: State, ts: Float[np.ndarray, " n"]) -
 
 def _in_double(run: Run, state: State, accuracy: Accuracy) -> Run:
     """A run from a state at an accuracy, in double precision."""
-    mechanism, state, t0, accuracy = cast((run.mechanism, state, run.t0, accuracy), jnp.dtype(float))
-    return run.changed(mechanism=mechanism, state=state, t0=t0, accuracy=accuracy)
+    flat, state, t0, accuracy = cast((run.flat, state, run.t0, accuracy), jnp.dtype(float))
+    return run.changed(flat=flat, state=state, t0=t0, accuracy=accuracy)
 
 
 def num_saves(solution: Solution) -> int:

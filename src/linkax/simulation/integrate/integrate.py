@@ -27,8 +27,8 @@ from linkax.simulation.integrate.switches import start_sides
 from linkax.simulation.start.initial_state import InitialCheck, check_initial_state
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
-from linkax.straight_line.known import KnownEntries
 from linkax.xla.arrays import Array
+from linkax.xla.flat import Flat
 from linkax.xla.tracing import Program, all_concrete, blank_result, concrete, is_first, jit_inline
 from linkax.xla.undefined import undefined_where
 
@@ -44,8 +44,8 @@ class Outcome(NamedTuple):
 
 def integrate_run(run: Run) -> Outcome:
     """Integrate a run, in three programs: another solver, formulation or saveat compiles no more than it must."""
-    given = run.mechanism, run.known, run.state, run.t0, run.tangent_space
-    if all_concrete(run) and is_first(run.mechanism.topology, run.known):
+    given = run.flat, run.state, run.t0, run.tangent_space
+    if all_concrete(run) and is_first(run.mechanism.topology, run.flat.noted):
         with ThreadPoolExecutor() as threads:
             # While XLA compiles one program, in a thread, Python traces the next.
             threads.submit(_check_start.lower(*given).compile)
@@ -64,18 +64,17 @@ def _closing(run, initial, integrated):
     """The arguments of `_closed`."""
     saveat: Any = run.options.saveat
     given = (integrated.ts, integrated.t_end), (integrated.ys, integrated.y_end), saves_states(saveat), _firsts(run)
-    return run.mechanism, run.known, run.formulation, run.accuracy, initial, *given
+    return run.flat, run.formulation, run.accuracy, initial, *given
 
 
 @Program
-def _check_start(mechanism, known, state, t0, tangent_space) -> InitialCheck:
-    dtype = state.q.dtype
-    return check_initial_state(tangent_space.prepared(dtype), system_of(mechanism, dtype, known=known), t0, state)
+def _check_start(flat, state, t0, tangent_space) -> InitialCheck:
+    system = system_of(flat.tree, state.q.dtype, known=flat.noted)
+    return check_initial_state(tangent_space.prepared(system.dtype), system, t0, state)
 
 
 def problem_of(
-    mechanism: Mechanism,
-    known: KnownEntries,
+    flat: Flat[Mechanism],
     formulation: AbstractFormulation,
     accuracy: Accuracy,
     initial: InitialCheck,
@@ -83,9 +82,8 @@ def problem_of(
     """The initial value problem's right-hand side from a state that was checked."""
     dtype = initial.state.q.dtype
     start = initial.can_start, initial.t, initial.singular
-    return Problem(
-        mechanism, system_of(mechanism, dtype, known=known), formulation.prepared(dtype, initial.rank), accuracy, *start
-    )
+    system = system_of(flat.tree, dtype, known=flat.noted)
+    return Problem(flat.tree, system, formulation.prepared(dtype, initial.rank), accuracy, *start)
 
 
 @jit_inline
@@ -93,9 +91,9 @@ def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     dtype = initial.state.q.dtype
     formulation, t0, t1, options, control = cast((run.formulation, run.t0, run.t1, run.options, run.control), dtype)
     in_order, t0, t1, dt0, saveat = _in_order(t0, t1, options.dt0, options.saveat)
-    problem = problem_of(run.mechanism, run.known, formulation, run.accuracy, initial)
+    problem = problem_of(run.flat, formulation, run.accuracy, initial)
     problem = eqx.tree_at(lambda p: p.can_start, problem, problem.can_start & in_order)
-    inputs = run.mechanism, initial.state, t0, t1, dt0, saveat
+    inputs = run.flat, initial.state, t0, t1, dt0, saveat
     if not saves_states(saveat):
         saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))
     q, v = initial.state.q, initial.state.v
@@ -199,11 +197,9 @@ def _firsts(run):
 
 
 @jit_inline
-def _closed(
-    mechanism, known, formulation, accuracy, initial, times, values, saves, firsts
-) -> tuple[State, State | None]:
+def _closed(flat, formulation, accuracy, initial, times, values, saves, firsts) -> tuple[State, State | None]:
     """The state at the end, and those that are saved, on the loops; infinite where none was saved."""
-    problem = problem_of(mechanism, known, formulation, accuracy, initial)
+    problem = problem_of(flat, formulation, accuracy, initial)
     (ts, t_end), (ys, y_end) = times, values
     if not saves:
         return problem.close(t_end, y_end), None

@@ -1,6 +1,7 @@
 """Checks of the options of a run, most of them diffrax's own objects, before anything is compiled."""
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeVar
 
 import diffrax
@@ -108,10 +109,15 @@ def check_saved_times(
 
 def saves_times(saveat: diffrax.SaveAt | None) -> bool:
     """Whether states are saved at given times, and nothing else."""
-    if jax.tree.structure(saveat) != jax.tree.structure(save_at(np.zeros(1))):
+    if jax.tree.structure(saveat) != _structure_of_times():
         return False
     (sub,) = _subs(saveat)
     return not (sub.t0 or sub.t1 or sub.steps)
+
+
+@cache
+def _structure_of_times():
+    return jax.tree.structure(save_at(np.zeros(1)))
 
 
 def save_at(ts: Any) -> diffrax.SaveAt:

@@ -68,15 +68,14 @@ ENDED_WELL = ("successful", "event_occurred")
 
 def result_name(result: RESULTS) -> str:
     """The name of a result, such as "successful" or "max_steps_reached"."""
-    for name in KNOWN_RESULTS:
-        if bool(result == getattr(RESULTS, name)):
-            return name
-    return "failed"
+    number = int(code(result))
+    return next((name for name in KNOWN_RESULTS if number == int(code(getattr(RESULTS, name)))), "failed")
 
 
 def remark_name(remark: "REMARKS") -> str:
     """The name of a remark, such as "none" or "stiff"."""
-    return next((name for name in WARNINGS if code(remark) == code(getattr(REMARKS, name))), "none")
+    number = int(code(remark))
+    return next((name for name in WARNINGS if number == int(code(getattr(REMARKS, name)))), "none")
 
 
 class REMARKS(eqx.Enumeration):

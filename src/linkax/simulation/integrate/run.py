@@ -32,8 +32,9 @@ from linkax.simulation.integrate.options import (
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time
-from linkax.straight_line.known import KnownEntries
+from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array, ScalarLike
+from linkax.xla.flat import Flat
 from linkax.xla.tracing import all_concrete, concrete
 
 DEFAULT_FORMULATION = TangentSpace()
@@ -56,34 +57,22 @@ class DiffraxOptions(NamedTuple):
     progress_meter: diffrax.AbstractProgressMeter | None = None
 
 
-class _Frozen(eqx.Module):
-    """A pytree of which only arrays are leaves, so that JAX transformations can return it."""
-
-    arrays: Any
-    rest: Any = eqx.field(static=True)
-
-    @staticmethod
-    def of(tree: Any) -> "_Frozen":
-        return _Frozen(*eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array | np.ndarray | np.generic)))
-
-
 class Run(eqx.Module):
     """One run of a mechanism from a state at t0 to t1 [s], as `linkax.simulate` was asked for it.
 
     - `formulation`: of the equations of motion. `accuracy`: tolerances and projection.
     - `saves_times`: whether states are saved at given times, and nothing else.
-    - `known`: which entries of the mechanism's arrays its programs may know.
+    - `flat`: the mechanism; noted is which entries of its arrays programs may know.
     """
 
-    mechanism: Mechanism
+    flat: Flat[Mechanism]
     state: State
     t0: Float[Array, "*batch"] | float | np.floating
     t1: Float[Array, "*batch"] | float | np.floating
     formulation: AbstractFormulation
     accuracy: Accuracy
     saves_times: bool = eqx.field(static=True)
-    known: KnownEntries = eqx.field(static=True)
-    _options: DiffraxOptions | _Frozen | None
+    _options: Flat[DiffraxOptions] | None
 
     @staticmethod
     def of(
@@ -109,18 +98,20 @@ class Run(eqx.Module):
         check_kinds(**{name: entry for name, entry in given.items() if name not in ("dt0", "max_steps")})
         formulation = checked_formulation(formulation, accuracy)
         options = _filled_in(mechanism, state, accuracy, t0, t1, **given)
-        known = KnownEntries.of(mechanism)
-        mechanism, state, t0, accuracy = cast((mechanism, state, t0, accuracy), dtype)
-        saves = saves_times(options.saveat)
-        return Run(mechanism, state, t0, t1, formulation, accuracy, saves, known, options)
+        flat, state, t0, accuracy = cast((flat_with_known(mechanism), state, t0, accuracy), dtype)
+        return Run(flat, state, t0, t1, formulation, accuracy, saves_times(options.saveat), Flat.of(options))
 
     @staticmethod
     def of_state(
         mechanism: Mechanism, state: State, t: ScalarLike, formulation: AbstractFormulation, accuracy: Accuracy
     ) -> "Run":
         """What a state alone says of a run: nothing is stepped."""
-        known = KnownEntries.of(mechanism)
-        return Run(mechanism, state, t, t, formulation, accuracy, False, known, None)
+        return Run(flat_with_known(mechanism), state, t, t, formulation, accuracy, False, None)
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """What moves."""
+        return self.flat.tree
 
     @property
     def is_integrated(self) -> bool:
@@ -131,7 +122,7 @@ class Run(eqx.Module):
     def options(self) -> DiffraxOptions:
         """diffrax's objects."""
         options: Any = self._options
-        return eqx.combine(options.arrays, options.rest) if isinstance(options, _Frozen) else options
+        return options.tree
 
     @property
     def control(self) -> MechanismControl:
@@ -163,12 +154,12 @@ class Run(eqx.Module):
         options = {name: changes.pop(name) for name in DiffraxOptions._fields if name in changes}
         if "saveat" in options:
             changes["saves_times"] = saves_times(options["saveat"])
-        return dataclasses.replace(self, **changes, _options=self.options._replace(**options))
+        return dataclasses.replace(self, **changes, _options=Flat.of(self.options._replace(**options)))
 
     def remembered(self) -> "Run":
         """What a solution keeps: to run it again, or a part of it, without the functions of a user."""
         dt0, solver, controller, max_steps, *_ = self.options
-        return dataclasses.replace(self, _options=_Frozen.of(DiffraxOptions(dt0, solver, controller, max_steps)))
+        return dataclasses.replace(self, _options=Flat.of(DiffraxOptions(dt0, solver, controller, max_steps)))
 
 
 def checked_formulation(

@@ -20,9 +20,9 @@ from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
 from linkax.simulation.start.state import State
-from linkax.straight_line.known import KnownEntries
 from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
+from linkax.xla.flat import Flat
 from linkax.xla.tracing import Program, all_concrete, blank_result, is_first
 
 FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
@@ -30,8 +30,8 @@ FEW = 1.5e7  # times of all members, times the square of unknowns: reading more,
 
 def read_in_motion(function: Callable[..., Any], solution: Solution, *details: Any) -> Any:
     """Read a function that needs v̇ or λ: these are solved by one program for all such functions, and passed in."""
-    mechanism, known = solution.mechanism, solution.run.known
-    if solution.q is not None and all_concrete(solution) and is_first(function, mechanism.topology, known):
+    flat = solution.run.flat
+    if solution.q is not None and all_concrete(solution) and is_first(function, flat.tree.topology, flat.noted):
         with ThreadPoolExecutor() as threads:
             program, *given = _asked(solution, Observables.solve, (), ())
             threads.submit(program.lower(*given).compile)
@@ -60,15 +60,14 @@ def _asked(solution, function, dynamics, details):
     topology, run = solution.mechanism.topology, solution.run
     few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
     states = solution.ts, solution.q, solution.v
-    motion = SavedMotion(run.mechanism, run.known, run.formulation, run.tangent_space, solution.rank_nearby, *states)
+    motion = SavedMotion(run.flat, run.formulation, run.tangent_space, solution.rank_nearby, *states)
     return _of_times if few else _of_times.optimised, function, motion, dynamics, details
 
 
 class SavedMotion(NamedTuple):
     """What is read: with another solver or tolerance the same program reads it."""
 
-    mechanism: Mechanism
-    known: KnownEntries
+    flat: Flat[Mechanism]
     formulation: AbstractFormulation
     tangent_space: TangentSpace
     rank_nearby: Int[Array, "*batch k"] | None
@@ -95,7 +94,7 @@ def _kept(solution, key, compute):
 def _of_times(function, motion: SavedMotion, dynamics, details):
     def of_member(motion, dynamics, details):
         dtype = motion.q.dtype
-        system = system_of(motion.mechanism, dtype, fixed_scales=False, known=motion.known)
+        system = system_of(motion.flat.tree, dtype, fixed_scales=False, known=motion.flat.noted)
         tangent_space = motion.tangent_space.prepared(dtype, motion.rank_nearby)
         method = motion.formulation.prepared(dtype, motion.rank_nearby)
 
@@ -112,8 +111,7 @@ def _of_times(function, motion: SavedMotion, dynamics, details):
 
 @eqx.filter_jit
 def evaluate_dense(
-    mechanism: Mechanism,
-    known: KnownEntries,
+    flat: Flat[Mechanism],
     formulation: AbstractFormulation,
     accuracy: Accuracy,
     rank_nearby: Int[Array, " k"] | None,
@@ -123,5 +121,5 @@ def evaluate_dense(
     dtype = interpolation.t0.dtype
     t = jnp.asarray(t, dtype)
     y = interpolation.evaluate(t)
-    system, method = system_of(mechanism, dtype, known=known), formulation.prepared(dtype, rank_nearby)
-    return Problem(mechanism, system, method, accuracy).close(t, y)
+    system, method = system_of(flat.tree, dtype, known=flat.noted), formulation.prepared(dtype, rank_nearby)
+    return Problem(flat.tree, system, method, accuracy).close(t, y)

@@ -314,7 +314,7 @@ class Solution(eqx.Module):
         if first is not None and last is not None and first.shape == ():
             during = lambda t: (t >= first) & (t <= last)
             t = require(t, during, "t [s]", f"give a time of the run, from {first} s to {last} s")
-        given = self.mechanism, self.run.known, self.formulation, self.accuracy, self.rank_nearby, self.interpolation
+        given = self.run.flat, self.formulation, self.accuracy, self.rank_nearby, self.interpolation
         return evaluate_dense(*given, t)
 
     def _is_constraint(self, name):

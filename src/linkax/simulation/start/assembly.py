@@ -30,7 +30,7 @@ from linkax.simulation.start.validation import (
     sound_numbers,
     speeds_by_joint,
 )
-from linkax.straight_line.known import KnownEntries
+from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array
 from linkax.xla.static_scatter import scatter_static
 from linkax.xla.tracing import Program, all_concrete, jit_inline, without_derivatives
@@ -89,7 +89,7 @@ def assemble(
     for (name, _), _ in begin.by_term():
         if name not in mechanism.topology.coordinates:
             raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
-    state, remainder = _assembled(mechanism, KnownEntries.of(mechanism), held, moving, begin, t)
+    state, remainder = _assembled(flat_with_known(mechanism), held, moving, begin, t)
     if not all_concrete((state, remainder)):
         return _marked(mechanism, state, remainder)
     remainder = jax.tree.map(np.asarray, remainder)
@@ -196,8 +196,8 @@ def _assembled(*given):
 
 
 @Program
-def _assemble(mechanism, known, positions, speeds, guess, t, *, branches):
-    demand, begin = _demand(mechanism, known, positions, guess, t)
+def _assemble(flat, positions, speeds, guess, t, *, branches):
+    demand, begin = _demand(flat, positions, guess, t)
     q = close_loops(demand, begin, None)
     system, configuration = demand.system, configure(demand.system, t, q)
     found = (speeds_on_branch if branches else smallest_speeds)(configuration, speeds)
@@ -226,15 +226,15 @@ def _assemble(mechanism, known, positions, speeds, guess, t, *, branches):
 @jit_inline
 def _assembled_again(given, q, branches):
     """The state whose coordinates are known, for its derivatives."""
-    mechanism, known, positions, speeds, guess, t = given
-    demand, begin = _demand(mechanism, known, positions, guess, t)
+    flat, positions, speeds, guess, t = given
+    demand, begin = _demand(flat, positions, guess, t)
     q = close_loops(demand, begin, q)
     return State(q, speeds_again(configure(demand.system, t, q), speeds, branches))
 
 
-def _demand(mechanism, known, positions, guess, t):
+def _demand(flat, positions, guess, t):
     """The problem of closing the loops, and the coordinates where the search begins."""
-    system = system_of(mechanism, jnp.result_type(float), known=known)
+    system = system_of(flat.tree, jnp.result_type(float), known=flat.noted)
     topology = system.topology
     q = jnp.asarray(neutral(topology, system.dtype))
     for given in (guess, positions):

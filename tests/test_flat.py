@@ -1,0 +1,94 @@
+"""A pytree as its arrays and one static object."""
+
+import gc
+import pickle
+import weakref
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import linkax as lx
+from linkax.scenes import SCENES
+from linkax.straight_line.known import KnownEntries, flat_with_known
+from linkax.xla.flat import Flat
+
+TREE = {"masses": np.array([1.0, 2.0]), "name": "rod", "of": (jnp.ones(3), None, 4.0)}
+
+
+def _mechanism():
+    scene = SCENES["crank-slider"]
+    return scene.mechanism(scene.settings())
+
+
+def test_tree_is_what_it_was_made_of():
+    flat = Flat.of(TREE, "noted")
+    assert eqx.tree_equal(flat.tree, TREE)
+    assert flat.noted == "noted"
+    assert len(jax.tree.leaves(flat)) == 2
+
+
+def test_jax_transforms_its_arrays_alone():
+    total = lambda flat: jnp.sum(flat.tree["masses"]) * flat.tree["of"][2]
+    assert jax.jit(total)(Flat.of(TREE)) == 12.0
+    assert np.all(jax.grad(total)(Flat.of(TREE)).tree["masses"] == 4.0)
+    batch = jax.vmap(lambda mass: Flat.of({**TREE, "masses": mass * TREE["masses"]}))(jnp.arange(3.0))
+    assert batch.tree["masses"].shape == (3, 2)
+    assert batch.tree["name"] == "rod"
+
+
+def test_compiles_again_only_for_another_static_part():
+    compiled = []
+
+    @eqx.filter_jit
+    def count(flat):
+        compiled.append(flat.tree["name"])
+        return flat.tree["masses"] + 1.0
+
+    for tree, noted in (
+        (TREE, 1),
+        ({**TREE, "masses": np.array([3.0, 4.0])}, 1),
+        (TREE, 2),
+        ({**TREE, "name": "crank"}, 1),
+        ({**TREE, "of": (jnp.ones(3), None, 5.0)}, 1),
+        (TREE, 1),
+    ):
+        count(Flat.of(tree, noted))
+    assert compiled == ["rod", "rod", "crank", "rod"]
+
+
+def test_pickles():
+    mechanism = _mechanism()
+    flat = flat_with_known(mechanism)
+    again = pickle.loads(pickle.dumps(flat))
+    assert eqx.tree_equal(again, flat)
+    assert again.noted == KnownEntries.of(mechanism)
+
+
+def test_kept_as_long_as_the_mechanism_lives():
+    mechanism = _mechanism()
+    first = flat_with_known(mechanism)
+    assert flat_with_known(mechanism) is first
+    heavier = eqx.tree_at(lambda m: m.bodies[0].mass, mechanism, mechanism.bodies[0].mass + 1.0)
+    assert flat_with_known(heavier) is not first
+    kept = weakref.ref(first)
+    del mechanism, first
+    gc.collect()
+    assert kept() is None
+
+
+def test_traced_mechanisms_are_not_kept():
+    def of(mass):
+        scene = SCENES["crank-slider"]
+        mechanism = scene.mechanism(scene.settings(changes={"rod_mass": mass}))
+        assert flat_with_known(mechanism) is not flat_with_known(mechanism)
+        return mass
+
+    jax.jit(of)(1.0)
+
+
+def test_solution_has_the_mechanism():
+    mechanism = _mechanism()
+    solution = lx.Solution.of_state(mechanism, lx.assemble(mechanism))
+    assert eqx.tree_equal(solution.mechanism, mechanism)
