@@ -17,6 +17,10 @@ from linkax.xla.flat import Flat
 TREE = {"masses": np.array([1.0, 2.0]), "name": "rod", "of": (jnp.ones(3), None, 4.0)}
 
 
+class Numbers(eqx.Module):
+    numbers: np.ndarray
+
+
 def _mechanism():
     scene = SCENES["crank-slider"]
     return scene.mechanism(scene.settings())
@@ -92,3 +96,10 @@ def test_solution_has_the_mechanism():
     mechanism = _mechanism()
     solution = lx.Solution.of_state(mechanism, lx.assemble(mechanism))
     assert eqx.tree_equal(solution.mechanism, mechanism)
+
+
+def test_arrays_that_can_be_written_to_are_read_each_time():
+    of_its_own = Numbers(np.zeros(2))
+    assert flat_with_known(of_its_own).noted != KnownEntries((None,))
+    of_its_own.numbers[:] = 3.0
+    assert flat_with_known(of_its_own).noted == KnownEntries((None,))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import linkax as lx
+from linkax.scenes import SCENES
 
 
 def body(name="part", mass=1.0, inertia=(1.0, 1.0, 1.0), **options):
@@ -275,3 +276,27 @@ def test_a_mechanism_keeps_its_numbers():
     np.testing.assert_array_equal(body.frames["tip"], [0.0, 0.0, 0.5])
     with pytest.raises(ValueError, match="read-only"):
         body.inertia[0, 0] = 2.0
+
+
+class Push(lx.AbstractForce):
+    """Of which NumPy has the numbers."""
+
+    frame: lx.Frame
+    force: np.ndarray
+
+    @property
+    def frames(self):
+        return (self.frame,)
+
+    def load(self, t, motion):
+        return motion.point_load(self.frame, self.force)
+
+
+def test_arrays_of_mechanisms_cannot_be_written_to():
+    arm, force = lx.rod("arm", 1.0, 1.0), np.zeros(3)
+    pushed = lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm, "z")], [Push(arm.at("tip"), force)])
+    force[0] = 1.0
+    assert np.all(pushed.forces[0].force == 0.0)
+    for mechanism in (pushed, *(scene.mechanism(scene.settings()) for scene in SCENES.values())):
+        for leaf in jax.tree.leaves(mechanism):
+            assert not isinstance(leaf, np.ndarray) or not leaf.flags.writeable

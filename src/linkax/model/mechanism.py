@@ -15,7 +15,7 @@ from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
-from linkax.model.numbers import listed, require_bool
+from linkax.model.numbers import listed, read_only, require_bool
 from linkax.model.spanning_tree import SpanningTree, spanning_tree
 from linkax.model.topology import GROUND_INDEX, Topology
 
@@ -64,11 +64,11 @@ class Mechanism(eqx.Module):
         parts = discretise_beams(*given)
         body_by_name = _check_names(parts)
         tree = _spanning_tree(list(body_by_name), parts)
-        self.bodies = tuple(body_by_name[name] for name in tree.bodies)
-        self.beams = tuple(body for body in given[0] if isinstance(body, Beam))
-        self.joints = (*tree.carriers, *tree.cuts)
-        self.forces = tuple(parts.forces)
-        self.constraints = tuple(parts.constraints)
+        self.bodies = read_only(tuple(body_by_name[name] for name in tree.bodies))
+        self.beams = read_only(tuple(body for body in given[0] if isinstance(body, Beam)))
+        self.joints = read_only((*tree.carriers, *tree.cuts))
+        self.forces = read_only(tuple(parts.forces))
+        self.constraints = read_only(tuple(parts.constraints))
         self.topology = _topology(tree, parts.constraints, require_bool(all_rows, "all_rows"))
 
     def with_all_rows(self) -> "Mechanism":

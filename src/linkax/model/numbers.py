@@ -28,6 +28,7 @@ Matrix = Array | Sequence[Number] | Sequence[Vector]
 Axis = str | Vector
 
 Kind = TypeVar("Kind")
+Tree = TypeVar("Tree")
 Word = TypeVar("Word", bound=str)
 Kinds = Any  # a class, or several, as `isinstance` takes them
 
@@ -85,9 +86,20 @@ def _in_double(entry: Any) -> Array:
         return jnp.asarray(entry, dtype=float)
     if any(isinstance(part, jax.Array) for part in jax.tree.leaves(entry)):
         return remember(jnp.stack([jnp.asarray(part, dtype=float) for part in entry]), _known_parts(entry))
-    array = np.array(entry, dtype=np.float64)  # not that of the caller, which may change
+    return _unchanging(entry, np.dtype(float))
+
+
+def _unchanging(entry: Any, dtype: np.dtype) -> np.ndarray:
+    """A copy that cannot be written to: that of the caller may change."""
+    array = np.array(entry, dtype=dtype)
     array.flags.writeable = False
     return array
+
+
+def read_only(tree: Tree) -> Tree:
+    """Replace NumPy arrays that can be written to by copies that cannot."""
+    can_change = lambda leaf: isinstance(leaf, np.ndarray) and leaf.flags.writeable
+    return jax.tree.map(lambda leaf: _unchanging(leaf, leaf.dtype) if can_change(leaf) else leaf, tree)
 
 
 def _known_parts(entry):

@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,9 +18,9 @@ import numpy as np
 from linkax.straight_line.program import Pattern, straighten
 from linkax.xla.arrays import Array
 from linkax.xla.flat import Flat
-from linkax.xla.tracing import all_concrete, concrete
+from linkax.xla.kept import kept_while_alive
+from linkax.xla.tracing import concrete
 
-Tree = TypeVar("Tree")
 MOST_KEPT = 256  # of what functions make of known entries
 
 
@@ -82,18 +82,10 @@ def known_values(array: Any) -> np.ndarray | None:
     return _remembered.get(id(array)) if known is None else known
 
 
-_flat: dict[int, Flat] = {}  # of trees that are alive, by their identity
-
-
-def flat_with_known(tree: Tree) -> Flat[Tree]:
-    """A tree whose `noted` is what is known of its arrays; kept while it lives where none is traced."""
-    if id(tree) in _flat:
-        return _flat[id(tree)]
-    flat = Flat.of(tree, KnownEntries.of(tree))
-    if all_concrete(flat):
-        _flat[id(tree)] = flat
-        weakref.finalize(tree, _flat.pop, id(tree))
-    return flat
+@kept_while_alive
+def flat_with_known(tree: Any) -> Flat:
+    """A tree whose `noted` is what is known of its arrays."""
+    return Flat.of(tree, KnownEntries.of(tree))
 
 
 class KnowsEntries(eqx.Module):

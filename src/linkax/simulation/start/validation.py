@@ -19,6 +19,7 @@ from linkax.model.terms import TermLike, term
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
+from linkax.xla.kept import kept_while_alive
 from linkax.xla.tracing import concrete
 
 # What a user may give for joints, by their names, or by (name, index of a speed).
@@ -57,6 +58,7 @@ def check_mechanism(mechanism: Mechanism) -> None:
         )
 
 
+@kept_while_alive
 def sound_numbers(mechanism: Mechanism) -> Bool[Array, ""] | np.bool_:
     """Whether all numbers of a mechanism that are or were traced are possible, see `linkax.model.numbers.require`.
 
