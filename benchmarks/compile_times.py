@@ -1,13 +1,16 @@
 """What a first run waits for: tracing and compiling, BALANCED unless named.
 
 first-runs: `linkax.assemble` (all that a scene does for its start), `linkax.simulate` over 10 s and the reaction of a
-joint: by how much the first of equal runs takes longer than the others. programs:
+joint: by how much the first of equal runs takes longer than the others; `run_ms` is one of these others. gradient:
+likewise the derivative of the crank-slider's end by the mass of its rod, with the assembly of the start and from a
+given start. programs:
 compiled as one each, simulations and their gradients: the crank-slider SC1 over 10 s; Bricard's mechanism over 1 s; and
 a row of four four-bars over 1 s with twenty parameters: masses and inertias of nine bodies, gravity, angle at the
 start.
 """
 
 import time
+from functools import partial
 
 import diffrax
 import equinox as eqx
@@ -20,7 +23,7 @@ from linkax.scenes import SCENES
 
 SCENE = SCENES["crank-slider"]
 REPEATS = 7
-FIRST_RUNS = (("crank-slider", {}), ("bricard", {}), ("n-four-bar", {"N": 40}))
+FIRST_RUNS = (("crank-slider", {}), ("bricard", {}), *(("n-four-bar", {"N": count}) for count in (5, 10, 20, 40)))
 
 
 def motion(numbers, accuracy):
@@ -88,12 +91,32 @@ def first_run(name, changes):
     simulate = lambda: lx.simulate(mechanism, assemble(), t1=10.0)
     read = lambda: simulate().reaction(mechanism.topology.joints[0])
     stages = {"assemble_s": assemble, "simulate_s": lambda: simulate().q, "reaction_s": read}
-    waits = {stage: round(seconds_of(run) - least(run), 2) for stage, run in stages.items()}
-    return {"scene": name, **changes, **waits, "sum_s": round(sum(waits.values()), 2)}
+    waits, ran = {}, {}
+    for stage, run in stages.items():
+        first, ran[stage] = seconds_of(run), least(run)
+        waits[stage] = round(first - ran[stage], 2)
+    run_ms = milliseconds(ran["simulate_s"] - ran["assemble_s"])
+    return {"scene": name, **changes, **waits, "sum_s": round(sum(waits.values()), 2), "run_ms": run_ms}
 
 
 def first_runs():
     yield from (first_run(name, changes) for name, changes in FIRST_RUNS)
+
+
+def gradients():
+    settings = SCENE.settings("SC1", {"rod": 2.0, "angle": 0.8})
+    start = jax.tree.map(jnp.asarray, SCENE.initial(SCENE.mechanism(settings), settings))
+
+    def end(rod_mass, given=None):
+        mechanism = SCENE.mechanism(settings | {"rod_mass": rod_mass})
+        state = SCENE.initial(mechanism, settings) if given is None else given
+        return lx.simulate(mechanism, state, t1=1.0, saveat=diffrax.SaveAt(t1=True)).end.q[0]
+
+    for name, given in (("with its assembly", None), ("from a given start", start)):
+        jax.clear_caches()
+        run = partial(jax.grad(end), 1.0, given)
+        first, then = seconds_of(run), least(run)
+        yield {"gradient": name, "first_s": round(first - then, 2), "run_ms": milliseconds(then)}
 
 
 def programs():
@@ -118,4 +141,4 @@ def programs():
 
 
 if __name__ == "__main__":
-    print_parts(__doc__, {"first-runs": first_runs, "programs": programs})
+    print_parts(__doc__, {"first-runs": first_runs, "gradient": gradients, "programs": programs})
