@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from linkax.plotting.colours import BLUE, GREEN, INK, VERMILION
-from linkax.plotting.scenery import BodyPoint
+from linkax.simulation.read.by_name import BodyPoint
 from linkax.simulation.read.solution import Solution
 
 COMPONENT_COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}

@@ -11,7 +11,8 @@ from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.mechanism import Mechanism
 from linkax.model.ropes import ElasticRope, Rope
-from linkax.simulation.read.solution import BodyPoint, Solution
+from linkax.simulation.read.by_name import BodyPoint
+from linkax.simulation.read.solution import Solution
 
 NEGLIGIBLE = 1e-9  # length in the picture up to which a direction is seen from its end
 Points = Mapping[str, tuple[str, BodyPoint]]  # {name of a point: its body, and where on it}

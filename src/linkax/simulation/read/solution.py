@@ -1,7 +1,7 @@
 """The motion that a simulation found, and what can be read from it."""
 
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
-from linkax.model.numbers import Number, Vector, number, one_of, real, require
+from linkax.model.numbers import Number, number, require
 from linkax.simulation.explain.error_estimate import refined_run
 from linkax.simulation.explain.remarks import remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
@@ -21,6 +21,15 @@ from linkax.simulation.integrate.integrate import Outcome, integrate_run
 from linkax.simulation.integrate.options import check_accuracy
 from linkax.simulation.integrate.results import REMARKS, RESULTS
 from linkax.simulation.integrate.run import Run, checked_formulation
+from linkax.simulation.read.by_name import (
+    BodyPoint,
+    is_constraint,
+    of_body,
+    of_constraint,
+    of_joint,
+    of_point,
+    reaction_of,
+)
 from linkax.simulation.read.observables import Observables, Pose, Power, Violation
 from linkax.simulation.read.passages import Passages, passages
 from linkax.simulation.read.reading import evaluate_dense, read, read_in_motion
@@ -29,9 +38,6 @@ from linkax.simulation.start.validation import checked_state, checked_time, soun
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete, jit_inline
-
-# A point of a body: a frame, a position on it, or None for its centre of mass, see `Solution.position`.
-BodyPoint = str | Number | Vector | None
 
 
 class Solution(eqx.Module):
@@ -149,23 +155,23 @@ class Solution(eqx.Module):
         `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m]. On a beam,
         "base", "tip", a distance along the axis [m], or [x, y, z] off it.
         """
-        return self._of_point(Observables.position, body, at)
+        return of_point(Observables.position, self, body, at)
 
     def velocity(self, body: str, at: BodyPoint = None) -> Float[Array, "*batch n_t 3"]:
         """Velocity of a body's centre of mass, or of the point `at` on it [m/s]."""
-        return self._of_point(Observables.velocity, body, at)
+        return of_point(Observables.velocity, self, body, at)
 
     def acceleration(self, body: str, at: BodyPoint = None) -> Float[Array, "*batch n_t 3"]:
         """Acceleration of a body's centre of mass, or of the point `at` on it [m/s²]."""
-        return self._of_point(Observables.acceleration, body, at)
+        return of_point(Observables.acceleration, self, body, at)
 
     def orientation(self, body: str) -> Float[Array, "*batch n_t 3 3"]:
         """Axes of a body's reference frame, as columns."""
-        return read(Observables.orientation, self, self._body(body))
+        return of_body(Observables.orientation, self, body)
 
     def angular_velocity(self, body: str) -> Float[Array, "*batch n_t 3"]:
         """Angular velocity of a body [rad/s]."""
-        return read(Observables.angular_velocity, self, self._body(body))
+        return of_body(Observables.angular_velocity, self, body)
 
     def poses(self) -> dict[str, Pose]:
         """Reference frames of all bodies by name, of a beam those of its sections: what an animation needs."""
@@ -175,11 +181,11 @@ class Solution(eqx.Module):
 
     def joint(self, name: str) -> Float[Array, "..."]:
         """Coordinate of a joint, in the tree or cut [rad or m]; (n_t, n) where it has several."""
-        return self._joint(Observables.joint, name)
+        return of_joint(Observables.joint, self, name)
 
     def joint_speed(self, name: str) -> Float[Array, "..."]:
         """Speed of a joint, in the tree or cut [rad/s or m/s]."""
-        return self._joint(Observables.joint_speed, name)
+        return of_joint(Observables.joint_speed, self, name)
 
     def strain(self, beam: str) -> Float[Array, "*batch n_t n 6"]:
         """Strains of a beam at its nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
@@ -205,9 +211,9 @@ class Solution(eqx.Module):
         `reaction_unique` tells which components can be relied upon. Of a run through a singular configuration they
         are limits along the motion there; not numbers where they have none, but grow without bound towards it.
         """
-        if self._is_constraint(name):
-            return self._of_constraint(Observables.constraint_forces, name)
-        return self._of_joint(Observables.reactions, name, on, axes)
+        if is_constraint(self, name):
+            return of_constraint(Observables.constraint_forces, self, name)
+        return reaction_of(Observables.reactions, self, name, on, axes)
 
     def reaction_unique(self, name: str, *, on: Side = "child", axes: Axes = "ground") -> Any:
         """Which components of `reaction` the mechanics determine, as booleans of the same shapes.
@@ -216,9 +222,9 @@ class Solution(eqx.Module):
         (Wojtyra, Multibody System Dynamics 13, 2005). Rigid bodies determine no more: the rest
         depends on elasticity, assembly, and here on the choice of the tree.
         """
-        if self._is_constraint(name):
-            return self._of_constraint(Observables.unique_constraint_forces, name)
-        return self._of_joint(Observables.unique, name, on, axes)
+        if is_constraint(self, name):
+            return of_constraint(Observables.unique_constraint_forces, self, name)
+        return reaction_of(Observables.unique, self, name, on, axes)
 
     def reactions(self) -> dict[str, Reaction]:
         """The reactions of all joints on their children, in ground axes, by name."""
@@ -316,62 +322,6 @@ class Solution(eqx.Module):
             t = require(t, during, "t [s]", f"give a time of the run, from {first} s to {last} s")
         given = self.run.flat, self.formulation, self.accuracy, self.rank_nearby, self.interpolation
         return evaluate_dense(*given, t)
-
-    def _is_constraint(self, name):
-        return isinstance(name, str) and name in self.mechanism.topology.constraints
-
-    def _of_constraint(self, function, name):
-        """Force of one constraint; computed for all, so that names share one program."""
-        return read_in_motion(function, self)[..., self.mechanism.topology.constraints.index(name)]
-
-    def _of_joint(self, function, name, on, axes):
-        """Reaction of one joint; computed for all, so that names share one program."""
-        for what, entry, choices in (("on", on, get_args(Side)), ("axes", axes, get_args(Axes))):
-            one_of(entry, choices, what)
-        self.mechanism.joint(name)
-        index = self.mechanism.topology.joints.index(name)
-        force, moment = read_in_motion(function, self, on, axes)
-        return Reaction(force[..., index, :], moment[..., index, :])
-
-    def _body(self, name):
-        body = self.mechanism.body(name)
-        if isinstance(body, Beam):
-            some = ", ".join(map(repr, body.sections[:3]))
-            raise ValueError(f"{name!r} is a beam and bends; ask for one of its sections, {some}, ...")
-        return self._index(name)
-
-    def _index(self, section):
-        """Index of a body, for each member of a batch: traced, so that names share one program."""
-        return np.full(self.ts.shape[:-1], self.mechanism.topology.bodies.index(section))
-
-    def _of_point(self, function, body, at):
-        """Read a function of `Observables` for a point of a rigid body or of a beam."""
-        found = self.mechanism.body(body)
-        reader = read_in_motion if function is Observables.acceleration else read
-        if at is None and isinstance(found, Beam):
-            sections = np.stack([*map(self._index, found.sections)], axis=-1)
-            return reader(Observables.center_of_mass, self, function, sections)
-        if at is None and not isinstance(found, Beam):
-            return reader(function, self, self._index(body), found.center_of_mass)
-        if isinstance(at, str):
-            frame = found.at(at)
-            offset = jnp.broadcast_to(frame.offset, (*self.ts.shape[:-1], 3))
-            return reader(function, self, self._index(frame.body), offset)
-        what = f"point on body {body!r} [m]"
-        offset = real(at, what)
-        if isinstance(found, Beam) and offset.shape == ():
-            offset = number(offset, (), what) * np.eye(3)[0]
-        offset = number(offset, (3,), what)
-        offset = found.within(offset, what) if isinstance(found, Beam) else offset
-        offset = jnp.broadcast_to(offset, (*self.ts.shape[:-1], 3))
-        if isinstance(found, Beam):
-            return reader(Observables.on_beam, self, function, found, offset)
-        return reader(function, self, self._index(body), offset)
-
-    def _joint(self, function, name):
-        self.mechanism.joint(name)
-        values = read(function, self, name)
-        return values[..., 0] if values.shape[-1] == 1 else values
 
 
 @jit_inline

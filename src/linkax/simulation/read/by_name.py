@@ -1,0 +1,102 @@
+"""Functions of `Observables` for what a user names: a point of a body, a joint, a constraint.
+
+Names share programs: what is named comes as a traced index, or is taken out of what is read of all.
+"""
+
+from collections.abc import Callable
+from typing import Any, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from linkax.equations.reactions import Axes, Reaction, Side
+from linkax.model.beams import Beam
+from linkax.model.numbers import Number, Vector, number, one_of, real
+from linkax.simulation.integrate.results import Solution
+from linkax.simulation.read.observables import Observables
+from linkax.simulation.read.reading import read, read_in_motion
+from linkax.xla.arrays import Array
+
+# A point of a body: a frame, a position on it, or None for its centre of mass, see `Solution.position`.
+BodyPoint = str | Number | Vector | None
+
+
+def of_point(
+    function: Callable[..., Any], solution: Solution, body: str, at: BodyPoint
+) -> Float[Array, "*batch n_t 3"]:
+    """Read a function for a point of a rigid body or of a beam.
+
+    **Raises:** `ValueError` for an unknown body or frame, and a wrong position.
+    """
+    found = solution.mechanism.body(body)
+    reader = read_in_motion if function is Observables.acceleration else read
+    if at is None and isinstance(found, Beam):
+        sections = np.stack([_index(solution, section) for section in found.sections], axis=-1)
+        return reader(Observables.center_of_mass, solution, function, sections)
+    if at is None and not isinstance(found, Beam):
+        return reader(function, solution, _index(solution, body), found.center_of_mass)
+    if isinstance(at, str):
+        frame = found.at(at)
+        offset = jnp.broadcast_to(frame.offset, (*solution.ts.shape[:-1], 3))
+        return reader(function, solution, _index(solution, frame.body), offset)
+    what = f"point on body {body!r} [m]"
+    offset = real(at, what)
+    if isinstance(found, Beam) and offset.shape == ():
+        offset = number(offset, (), what) * np.eye(3)[0]
+    offset = number(offset, (3,), what)
+    offset = found.within(offset, what) if isinstance(found, Beam) else offset
+    offset = jnp.broadcast_to(offset, (*solution.ts.shape[:-1], 3))
+    if isinstance(found, Beam):
+        return reader(Observables.on_beam, solution, function, found, offset)
+    return reader(function, solution, _index(solution, body), offset)
+
+
+def of_body(function: Callable[..., Any], solution: Solution, body: str) -> Float[Array, "..."]:
+    """Read a function of a rigid body.
+
+    **Raises:** `ValueError` for an unknown body and for a beam.
+    """
+    found = solution.mechanism.body(body)
+    if isinstance(found, Beam):
+        some = ", ".join(map(repr, found.sections[:3]))
+        raise ValueError(f"{body!r} is a beam and bends; ask for one of its sections, {some}, ...")
+    return read(function, solution, _index(solution, body))
+
+
+def of_joint(function: Callable[..., Any], solution: Solution, name: str) -> Float[Array, "..."]:
+    """Read a function of a joint: (n_t,), or (n_t, n) where it has several numbers.
+
+    **Raises:** `ValueError` for an unknown joint.
+    """
+    solution.mechanism.joint(name)
+    values = read(function, solution, name)
+    return values[..., 0] if values.shape[-1] == 1 else values
+
+
+def reaction_of(function: Callable[..., Any], solution: Solution, name: str, on: Side, axes: Axes) -> Reaction:
+    """Read a function of reactions for one joint.
+
+    **Raises:** `ValueError` for an unknown joint, side or axes.
+    """
+    for what, entry, choices in (("on", on, get_args(Side)), ("axes", axes, get_args(Axes))):
+        one_of(entry, choices, what)
+    solution.mechanism.joint(name)
+    index = solution.mechanism.topology.joints.index(name)
+    force, moment = read_in_motion(function, solution, on, axes)
+    return Reaction(force[..., index, :], moment[..., index, :])
+
+
+def is_constraint(solution: Solution, name: str) -> bool:
+    """Whether this names a constraint."""
+    return isinstance(name, str) and name in solution.mechanism.topology.constraints
+
+
+def of_constraint(function: Callable[..., Any], solution: Solution, name: str) -> Float[Array, "..."]:
+    """Read a function of constraints' forces for one of them."""
+    return read_in_motion(function, solution)[..., solution.mechanism.topology.constraints.index(name)]
+
+
+def _index(solution, section) -> Int[np.ndarray, "*batch"]:
+    """The index of a body, for each member of a batch."""
+    return np.full(solution.ts.shape[:-1], solution.mechanism.topology.bodies.index(section))
