@@ -83,7 +83,7 @@ def assemble(
     fit several branches.
     """
     check_mechanism(mechanism)
-    t = jnp.asarray(checked_time(t, "t"))
+    t = checked_time(t, "t")
     held, begin = (coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess")))
     moving = speeds_by_joint(mechanism, speeds, "speed")
     for (name, _), _ in begin.by_term():
@@ -146,7 +146,7 @@ def _raise_if_open(mechanism, state, t, remainder):
                     f"the {what} asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not "
                     f"allow it together with the other {what}s given, so ask for fewer"
                 )
-    tolerance = rank_tolerance(state.q.dtype)
+    tolerance = np.asarray(rank_tolerance(state.q.dtype))  # with which nothing is compiled
     if not remainder.off_branch <= ON_BRANCH * tolerance:
         system = system_of(mechanism, state.q.dtype)
         basis = ConstraintSplit.at(system, t, state.q, tolerance).inverse.basis
