@@ -2,9 +2,9 @@
 
 One thing at a time differs from what linkax does by default. A row for each run: largest error of the tracked point
 [m], largest violations of positions and speeds (relative, see `linkax.Solution.worst_violation`), energy gained or lost
-over the largest kinetic energy, steps, evaluations of the equations, seconds to compile, milliseconds to run. Then what
-each preset comes to, and for each target the cheapest run of linkax and of each peer. Times are of this machine, this
-run: compare ratios.
+over the largest kinetic energy, steps, evaluations of the equations, seconds to compile, milliseconds to run, and with
+BALANCED inside `jax.jit`, where Python does nothing for each call. Then what each preset comes to, and for each target
+the cheapest run of linkax and of each peer. Times are of this machine, this run: compare ratios.
 
 The problems are ten seconds long; 201 positions are saved. The telescopic crane has a benchmark of its own.
 """
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,15 +76,18 @@ def measured(problem, choice, rtol, reference) -> dict:
     mechanism, state = problem.start()
     body, frame = problem.tracked
 
-    def run():
+    def simulate(mechanism, state):
         saveat = diffrax.SaveAt(ts=TIMES)
-        options = choice.options(rtol)
-        return jax.block_until_ready(lx.simulate(mechanism, state, t1=TIMES[-1], saveat=saveat, throw=False, **options))
+        return lx.simulate(mechanism, state, t1=TIMES[-1], saveat=saveat, throw=False, **choice.options(rtol))
+
+    def of(simulate):
+        return lambda: jax.block_until_ready(simulate(mechanism, state))
 
     began = time.perf_counter()
-    run()
+    of(simulate)()
     first = time.perf_counter() - began
-    found, seconds = timed(run)
+    found, seconds = timed(of(simulate))
+    inside = timed(of(eqx.filter_jit(simulate)))[1] if choice is DEFAULT and rtol == lx.BALANCED.rtol else None
     apart = np.linalg.norm(np.asarray(found.position(body, at=frame)) - reference, axis=-1)
     violation, energy = found.worst_violation(), np.asarray(found.energy())
     steps = int(found.stats["num_steps"])
@@ -97,6 +101,7 @@ def measured(problem, choice, rtol, reference) -> dict:
         "evaluations": evaluations(choice.solver, steps),
         "compile_s": max(first - seconds, 0.0),
         "run_ms": 1e3 * seconds,
+        **({} if inside is None else {"jit_ms": 1e3 * inside}),
         "result": lx.RESULTS[found.result],
     }
 
@@ -157,12 +162,13 @@ def targets(found: list[dict]) -> str:
 
 def presets(found: list[dict]) -> str:
     """A table in Markdown: error, steps and time of each preset, and seconds to compile a first run."""
-    lines = _head("problem", *(f"`{name}`" for name in PRESETS), "compiling")
+    lines = _head("problem", *(f"`{name}`" for name in PRESETS), "`BALANCED` inside `jax.jit`", "compiling")
     for key in dict.fromkeys(row["problem"] for row in found):
         own = [row for row in found if (row["problem"], row["value"]) == (key, DEFAULT.value)]
         at = [row for preset in PRESETS.values() for row in own if row["rtol"] == preset.rtol]
         told = [f"{row['error']:.0e} m, {row['steps']} steps, {row['run_ms']:.3g} ms" for row in at]
-        lines.append(f"| {key} | {' | '.join(told)} | {max(row['compile_s'] for row in own):.0f} s |")
+        (inside,) = (row["jit_ms"] for row in own if "jit_ms" in row)
+        lines.append(f"| {key} | {' | '.join(told)} | {inside:.3g} ms | {max(row['compile_s'] for row in own):.0f} s |")
     return "\n".join(lines)
 
 
