@@ -73,6 +73,9 @@ class Flat(Generic[Tree]):
         """For JAX."""
         return cls(tuple(arrays), structure)
 
+    def __repr__(self) -> str:
+        return repr(self.tree)
+
     def __reduce__(self) -> Any:
         # JAX does not pickle structures of classes.
         return Flat.of, (self.tree, self.noted)

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.model.beams import Beam
@@ -92,7 +92,7 @@ def is_constraint(solution: Solution, name: str) -> bool:
     return isinstance(name, str) and name in solution.mechanism.topology.constraints
 
 
-def of_constraint(function: Callable[..., Any], solution: Solution, name: str) -> Float[Array, "..."]:
+def of_constraint(function: Callable[..., Any], solution: Solution, name: str) -> Shaped[Array, "..."]:
     """Read a function of constraints' forces for one of them."""
     return read_in_motion(function, solution)[..., solution.mechanism.topology.constraints.index(name)]
 
