@@ -1,12 +1,11 @@
 """What a first run waits for: tracing and compiling, BALANCED unless named.
 
 first-runs: `linkax.assemble` (all that a scene does for its start), `linkax.simulate` over 10 s and the reaction of a
-joint: by how much the first of equal runs takes longer than the others; `run_ms` is one of these others. gradient:
-likewise the derivative of the crank-slider's end by the mass of its rod, with the assembly of the start and from a
-given start. programs:
-compiled as one each, simulations and their gradients: the crank-slider SC1 over 10 s; Bricard's mechanism over 1 s; and
-a row of four four-bars over 1 s with twenty parameters: masses and inertias of nine bodies, gravity, angle at the
-start.
+joint: by how much the first of equal runs takes longer than the others; `run_ms` is `simulate` alone, once compiled.
+gradient: likewise the derivative of M1n's end after 1 s by the mass of its rod, with the assembly of its start and from
+a given start. programs: compiled as one each, simulations and their gradients: the crank-slider SC1 over 10 s;
+Bricard's mechanism over 1 s; and a row of four four-bars over 1 s with twenty parameters: masses and inertias of nine
+bodies, gravity, angle at the start.
 """
 
 import time
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 
 import linkax as lx
 from benchmarks.parts import print_parts
+from benchmarks.problems import PROBLEMS
 from linkax.scenes import SCENES
 
 SCENE = SCENES["crank-slider"]
@@ -104,8 +104,8 @@ def first_runs():
 
 
 def gradients():
-    settings = SCENE.settings("SC1", {"rod": 2.0, "angle": 0.8})
-    start = jax.tree.map(jnp.asarray, SCENE.initial(SCENE.mechanism(settings), settings))
+    settings = PROBLEMS["M1n"].settings
+    _, start = PROBLEMS["M1n"].start()
 
     def end(rod_mass, given=None):
         mechanism = SCENE.mechanism(settings | {"rod_mass": rod_mass})
