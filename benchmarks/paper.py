@@ -28,8 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from known_answers import reference, start
 
 from benchmarks.parts import print_parts
-from linkax.plotting import plot_point_motion, plot_reaction
-from linkax.plotting.colours import BLUE, GREEN, VERMILION
+from linkax import plot
+from linkax.scenery.colours import BLUE, GREEN, VERMILION
 from linkax.scenes import SCENES
 from linkax.simulation.simulate import fixed_steps
 from linkax.studies.comparison import Stepping, compare
@@ -101,8 +101,8 @@ def slider(out):
     found = lx.simulate(mechanism, state, t1=10.0, accuracy=lx.PRECISE, saveat=diffrax.SaveAt(ts=ts))
     known = reference("crank_slider_SC1")
     within = ts <= 5.0 + 1e-9
-    _save(plot_point_motion(found, "slider"), out / "figure-8.png")
-    _save(plot_reaction(found, "guide"), out / "figure-11.png")
+    _save(plot.motion(found, "slider"), out / "figure-8.png")
+    _save(plot.reaction(found, "guide"), out / "figure-11.png")
     force = found.reaction("guide").force[:, 1]
     away = np.abs(np.cos(known["theta"])) > 0.01
     yield {

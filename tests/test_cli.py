@@ -86,6 +86,7 @@ def test_json_is_one_object_and_files_are_whole(capsys, tmp_path):
     assert len(frames) > 20
     assert np.std(frames[0]) > 1.0
     assert np.any(frames[0] != frames[len(frames) // 2])
+    assert "showMechanism" in (tmp_path / "mechanism.html").read_text()
     assert not [path for path in tmp_path.iterdir() if "unfinished" in path.name]
 
 

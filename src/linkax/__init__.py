@@ -6,6 +6,9 @@ computes in single precision all the same. It also adds to `XLA_FLAGS` what lets
 see `linkax.xla.flags`; import linkax before JAX makes its first array.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 import jax
 
 from linkax.xla.flags import set_flags
@@ -112,3 +115,14 @@ from linkax.studies.shooting import Shots as Shots  # noqa: E402
 from linkax.studies.shooting import shoot as shoot  # noqa: E402
 from linkax.studies.sweep import sweep as sweep  # noqa: E402
 from linkax.studies.sweep_result import Sweep as Sweep  # noqa: E402
+from linkax.view.page import View as View  # noqa: E402
+
+if TYPE_CHECKING:
+    from linkax import plot as plot
+
+
+def __getattr__(name: str) -> Any:
+    """Import `linkax.plot`, and matplotlib with it, when it is first used."""
+    if name == "plot":
+        return importlib.import_module("linkax.plot")
+    raise AttributeError(f"module 'linkax' has no attribute {name!r}")

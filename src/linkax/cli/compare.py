@@ -105,10 +105,10 @@ def _write(out, described, plotted) -> list[Path]:
     at_interrupt_in(out, lambda: f"the comparison is in {files[0]}")
     (out / PART).unlink(missing_ok=True)
     if plotted is not None:
-        from linkax.plotting.comparison import plot_comparison  # matplotlib takes its time
+        from linkax.plot.comparison import comparison  # matplotlib takes its time
 
         with written_whole(out / "comparison.png") as path:
-            plot_comparison(plotted).savefig(path, dpi=130, format="png")
+            comparison(plotted).savefig(path, dpi=130, format="png")
         files.append(out / "comparison.png")
     return files
 

@@ -69,7 +69,7 @@ def _simulate(arguments) -> int:
         (out / name).unlink(missing_ok=True)
     if not arguments.no_plots:
         progress("drawing", None)
-        from linkax.plotting.pictures import write_pictures  # matplotlib takes its time
+        from linkax.plot.pictures import write_pictures  # matplotlib takes its time
 
         files += write_pictures(run.solution, asked.points, out)
     end_progress()

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import numpy as np
@@ -17,6 +17,7 @@ from linkax.model.numbers import (
     namespace,
     number,
     numbers_of,
+    one_of,
     positive,
     require,
     require_type,
@@ -28,6 +29,7 @@ from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
 GROUND_NAME = "ground"
+Shape = Literal["box", "ellipsoid"]
 
 
 class Frame(eqx.Module):
@@ -94,6 +96,7 @@ class RigidBody(AbstractBody):
     - `center_of_mass`: [m], shape (3,).
     - `inertia`: inertia tensor about the centre of mass [kg m²], shape (3, 3), or its diagonal, shape (3,).
     - `frames`: named points `{"tip": [x, y, z]}` [m], for `body.at("tip")`.
+    - `shape`: how it is drawn: "box" or "ellipsoid", of this mass and inertia; None: by its joints and frames.
 
     **Raises:** `ValueError` for a mass that is negative or not finite, and for an inertia tensor that no body has: one
     that is not symmetric, with a negative principal moment, or with one larger than the sum of the others.
@@ -104,6 +107,7 @@ class RigidBody(AbstractBody):
     center_of_mass: Float[Array, "3"]
     inertia: Float[Array, "3 3"]
     frames: dict[str, Float[Array, "3"]]
+    shape: Shape | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -112,6 +116,8 @@ class RigidBody(AbstractBody):
         center_of_mass: Vector = (0.0, 0.0, 0.0),
         inertia: Matrix = (0.0, 0.0, 0.0),
         frames: Mapping[str, Vector] | None = None,
+        *,
+        shape: Shape | None = None,
     ) -> None:
         self.name = body_name(name)
         self.mass = zero_or_more(mass, f"body {name!r}: mass [kg]")
@@ -123,6 +129,7 @@ class RigidBody(AbstractBody):
             self._label(label): number(offset, (3,), f"body {name!r}: frame {label!r} [m]")
             for label, offset in frames.items()
         }
+        self.shape = None if shape is None else one_of(shape, get_args(Shape), f"body {name!r}: shape")
 
     def _label(self, label: Any) -> str:
         if not isinstance(label, str) or not label:
@@ -249,4 +256,4 @@ def box(name: str, size: Vector, mass: Number) -> RigidBody:
     size = require(number(size, (3,), what), lambda metres: (metres > 0.0).all(), what, "all must be positive")
     mass = number(mass, (), f"body {name!r}: mass [kg]")
     squares = size * size
-    return RigidBody(name, mass, inertia=mass / 12 * (squares.sum() - squares))
+    return RigidBody(name, mass, inertia=mass / 12 * (squares.sum() - squares), shape="box")

@@ -1,5 +1,6 @@
 """Mechanisms: bodies, joints, constraints and forces, checked, with a spanning tree."""
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -90,6 +91,12 @@ class Mechanism(eqx.Module):
         **Raises:** `ValueError` for an unknown name.
         """
         return self.joints[_find(name, self.topology.joints, "joint")]
+
+    def view(self, state: Any, path: str | os.PathLike | None = None, **settings: Any) -> Any:
+        """Show the mechanism at a `linkax.State` in three dimensions; see `linkax.Solution.view`."""
+        from linkax.simulation.read.solution import Solution
+
+        return Solution.of_state(self, state).view(path, **settings)
 
 
 def _find(name: Any, names: tuple[str, ...], what: str) -> int:

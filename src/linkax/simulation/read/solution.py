@@ -1,7 +1,8 @@
 """The motion that a simulation found, and what can be read from it."""
 
-from collections.abc import Callable
-from typing import Any
+import os
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -38,6 +39,11 @@ from linkax.simulation.start.validation import checked_state, checked_time, soun
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete, jit_inline
+
+if TYPE_CHECKING:
+    from linkax.view import View
+else:
+    View = Any  # of a higher layer
 
 
 class Solution(eqx.Module):
@@ -302,6 +308,32 @@ class Solution(eqx.Module):
         took many steps, and inside of JAX transformations always, which compiles longer: better return the `Solution`.
         """
         return remark(self)
+
+    def view(
+        self,
+        path: str | os.PathLike | None = None,
+        *,
+        points: Mapping[str, tuple[str, BodyPoint]] | None = None,
+        reactions: bool | list[str] = False,
+    ) -> View:
+        """Show the motion in three dimensions, in any browser or in a notebook.
+
+        The page needs no network. It turns, zooms and plays; names show where the pointer is. Bodies are drawn
+        through their joints and named frames, or by their shape, see `linkax.RigidBody`.
+
+        **Arguments:**
+
+        - `path`: an HTML file to write.
+        - `points`: {name: (body, at)} of points to label and trace, see `position`.
+        - `reactions`: joints whose forces on their children are shown as arrows, or `True` for all.
+
+        **Returns:** a `View`: the value of a notebook cell, or `solution.view().show()` for the browser.
+
+        **Raises:** `ValueError` for the solution of a batch, and for an unknown name.
+        """
+        from linkax.view import view
+
+        return view(self, path, points=points, reactions=reactions)
 
     def passages(self) -> Passages:
         """Times at which the motion goes through singular configurations, and the digits lost.

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from linkax.plotting import animate_mechanism, plot_energy, plot_point_motion, plot_reaction, plot_violations
-from linkax.plotting.scenery import Points
+from linkax import plot
+from linkax.scenery.scenery import Points
 from linkax.simulation.read.solution import Solution
 from linkax.studies.files import written_whole
 
@@ -14,14 +14,14 @@ def write_pictures(solution: Solution, points: Points, folder: Path) -> list[Pat
     """Write the pictures of a run, of the times that it reached, and return their paths.
 
     These are the motion of each named point (of the crank-slider's slider: Fig. 8 of the paper), the violations
-    (Fig. 10), the reaction of each joint on ground (of the guide: Fig. 11), the energy, and the animation
-    `mechanism.gif`.
+    (Fig. 10), the reaction of each joint on ground (of the guide: Fig. 11), the energy, and the mechanism in motion:
+    `mechanism.html`, in three dimensions for a browser, and the animation `mechanism.gif`.
     """
-    figures = {f"motion_{name}": plot_point_motion(solution, body, at, name) for name, (body, at) in points.items()}
-    figures |= {"violations": plot_violations(solution), "energy": plot_energy(solution)}
+    figures = {f"motion_{name}": plot.motion(solution, body, at, name) for name, (body, at) in points.items()}
+    figures |= {"violations": plot.violations(solution), "energy": plot.energy(solution)}
     for joint in solution.mechanism.joints:
         if joint.name in _on_ground(solution.mechanism):
-            figures[f"reaction_{joint.name}"] = plot_reaction(solution, joint.name)
+            figures[f"reaction_{joint.name}"] = plot.reaction(solution, joint.name)
     written = []
     for name, figure in figures.items():
         with written_whole(folder / f"{name}.png") as path:
@@ -29,8 +29,10 @@ def write_pictures(solution: Solution, points: Points, folder: Path) -> list[Pat
         written.append(folder / f"{name}.png")
     if np.sum(np.isfinite(np.asarray(solution.ts))) > 1:
         with written_whole(folder / "mechanism.gif") as path:
-            animate_mechanism(solution, path, points)
+            plot.animate(solution, path, points)
         written.append(folder / "mechanism.gif")
+        solution.view(folder / "mechanism.html", points=points)
+        written.append(folder / "mechanism.html")
     return written
 
 

@@ -3,7 +3,7 @@
 from matplotlib.figure import Figure
 
 from linkax.formulations.named import TANGENT_SPACE
-from linkax.plotting.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
+from linkax.scenery.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
 from linkax.studies.comparison_result import Comparison
 
 COLOURS = (VERMILION, GREEN, ORANGE, PURPLE, SKY, INK, FAINT)
@@ -11,7 +11,7 @@ MARKERS = {"": "o", "baumgarte": "s", "partitioning": "^", "projection": "D"}
 SMALLEST = 1e-16  # drawn in place of smaller errors: zero has no logarithm
 
 
-def plot_comparison(comparison: Comparison) -> Figure:
+def comparison(found: Comparison) -> Figure:
     """Plot the error [m] of each formulation against its run time [ms]; lines join the trials of one formulation.
 
     Colours show the base of a formulation, markers what is added to it, such as Baumgarte's stabilisation. Trials with
@@ -19,11 +19,11 @@ def plot_comparison(comparison: Comparison) -> Figure:
     """
     figure = Figure(figsize=(9.0, 5.2), layout="constrained")
     panel = figure.subplots()
-    names = list(dict.fromkeys(trial.formulation for trial in comparison.trials))
+    names = list(dict.fromkeys(trial.formulation for trial in found.trials))
     bases = list(dict.fromkeys(name.split("+")[0] for name in names if name != TANGENT_SPACE))
     for name in names:
         base, *added = name.split("+")
-        own = [trial for trial in comparison.trials if trial.formulation == name and trial.reached > 0.0]
+        own = [trial for trial in found.trials if trial.formulation == name and trial.reached > 0.0]
         ours = name == TANGENT_SPACE
         colour = BLUE if ours else COLOURS[bases.index(base) % len(COLOURS)]
         times, errors = [1e3 * trial.run_s for trial in own], [max(trial.error, SMALLEST) for trial in own]
@@ -39,10 +39,8 @@ def plot_comparison(comparison: Comparison) -> Figure:
                 zorder=4 if ours else 3,
             )
         panel.plot([], [], marker="*" if ours else MARKERS.get("+".join(added), "P"), color=colour, label=name)
-    panel.axhline(comparison.bound, color=FAINT, linestyle="--", linewidth=0.9)
-    panel.annotate(
-        "diverged above", (0.01, comparison.bound), xycoords=("axes fraction", "data"), va="bottom", color=INK
-    )
+    panel.axhline(found.bound, color=FAINT, linestyle="--", linewidth=0.9)
+    panel.annotate("diverged above", (0.01, found.bound), xycoords=("axes fraction", "data"), va="bottom", color=INK)
     panel.set_xscale("log")
     panel.set_yscale("log")
     panel.set_xlabel("run time [ms]")

@@ -1,0 +1,172 @@
+"""Plot time histories.
+
+Each function returns a `matplotlib.figure.Figure`, made without pyplot, so that it needs no display and leaves no
+global state. Save it by `lx.plot.energy(solution).savefig("energy.png")`, or let it be the last value of a notebook
+cell. All raise `ValueError` for an unknown name, and for the solution of a batch: plot one of its members.
+"""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from linkax.scenery.colours import BLUE, GREEN, INK, VERMILION
+from linkax.scenery.scenery import reached
+from linkax.simulation.read.by_name import BodyPoint
+from linkax.simulation.read.solution import Solution
+
+COMPONENT_COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
+NEGLIGIBLE = 1e-9  # size of a component, relative to the largest, up to which it is left out
+SMALLEST_VIOLATION = 1e-17  # drawn in place of zero, which has no logarithm
+
+
+def motion(solution: Solution, body: str, at: BodyPoint = None, name: str | None = None) -> Figure:
+    """Plot position [m], velocity [m/s] and acceleration [m/s²] of a point against time [s], along ground axes.
+
+    Components in which the point does not move are left out.
+
+    **Arguments:** `body`, `at`: the point, see `Solution.position`. `name`: of the point, in the title; by default the
+    body's.
+    """
+    solution = reached(solution)
+    histories = {
+        "position [m]": solution.position(body, at),
+        "velocity [m/s]": solution.velocity(body, at),
+        "acceleration [m/s²]": solution.acceleration(body, at),
+    }
+    shown = _present(histories["velocity [m/s]"])
+    figure, panels = _panels(f"Motion of {name or body}{_along(shown)}", 3)
+    for panel, (label, values) in zip(panels, histories.items(), strict=True):
+        _draw_components(panel, solution.ts, values, shown)
+        panel.set_ylabel(label)
+    _add_legend(figure, panels[0])
+    return figure
+
+
+def joint(solution: Solution, name: str) -> Figure:
+    """Plot coordinates and speeds of a joint, in the tree or cut, against time [s]; its docstring defines them."""
+    solution = reached(solution)
+    found = solution.mechanism.joint(name)
+    figure, panels = _panels(f"{type(found).__name__} {name}", 2)
+    units = sorted(set(found.speed_units), reverse=True)
+    histories = ("coordinate", "", solution.joint(name)), ("speed", "/s", solution.joint_speed(name))
+    for panel, (what, per, values) in zip(panels, histories, strict=True):
+        columns = np.asarray(values).reshape(len(solution.ts), -1)
+        panel.plot(solution.ts, columns, label=[f"{what} {index}" for index in range(columns.shape[1])])
+        panel.set_ylabel(f"{what}\n[{', '.join(unit + per for unit in units)}]")
+        if columns.shape[1] > 1:
+            panel.legend(frameon=False, fontsize="small")
+    return figure
+
+
+def reaction(solution: Solution, joint: str) -> Figure:
+    """Plot force [N] and moment [N m] of a joint on its child against time [s], along ground axes.
+
+    Components that are zero are left out. Those are hatched that redundant constraints leave undetermined, see
+    `Solution.reaction_unique`.
+    """
+    solution = reached(solution)
+    found, unique = solution.reaction(joint), solution.reaction_unique(joint)
+    child = solution.mechanism.joint(joint).child.body
+    largest = [float(np.max(np.abs(np.asarray(part)), initial=0.0)) for part in found]
+    drawn = [("force [N]", found.force, unique.force), ("moment [N m]", found.moment, unique.moment)]
+    drawn = [part for part, size in zip(drawn, largest, strict=True) if size > NEGLIGIBLE * max(largest)] or drawn[:1]
+    figure, panels = _panels(f"Reaction of {joint} on {child}", len(drawn))
+    for panel, (label, values, known) in zip(panels, drawn, strict=True):
+        shown = _present(values)
+        _draw_components(panel, solution.ts, values, shown)
+        _hatch(panel, solution.ts, np.asarray(values), ~np.asarray(known), shown)
+        panel.set_ylabel(label)
+        panel.legend(frameon=False, fontsize="small", loc="upper right")
+    return figure
+
+
+def violations(solution: Solution) -> Figure:
+    """Plot the largest violation of the loop rows, in positions, velocities and accelerations, against time [s].
+
+    See `linkax.Violation` for the units. Zeros are drawn at 1e-17.
+    """
+    solution = reached(solution)
+    figure, panels = _panels("Violation of the loops", 3)
+    levels = ("position\n[rad or loop lengths]", BLUE), ("velocity\n[1/s]", VERMILION), ("acceleration\n[1/s²]", GREEN)
+    for panel, (label, colour), values in zip(panels, levels, solution.violation(), strict=True):
+        drawn = np.maximum(np.asarray(values), SMALLEST_VIOLATION)
+        panel.semilogy(solution.ts, drawn, color=colour, linewidth=0.8)
+        label_of_line = "double precision, 2.2e-16"
+        panel.axhline(np.finfo(np.float64).eps, color=INK, linewidth=0.8, linestyle="--", label=label_of_line)
+        panel.set_ylabel(label)
+    _add_legend(figure, panels[0])
+    return figure
+
+
+def singularity(solution: Solution) -> Figure:
+    """Plot the distance from singular configurations, see `linkax.Accuracy`, against time [s]; lines mark passages."""
+    passages, solution = solution.passages(), reached(solution)
+    figure, (panel,) = _panels("Distance from singular configurations", 1)
+    distance = np.maximum(np.asarray(solution.singularity_distance()), SMALLEST_VIOLATION)
+    panel.semilogy(solution.ts, distance, color=BLUE)
+    for time in passages.times:
+        panel.axvline(float(time), color=VERMILION, linewidth=0.8, linestyle="--")
+    panel.set_ylabel("distance d")
+    return figure
+
+
+def energy(solution: Solution) -> Figure:
+    """Plot kinetic, potential and total energy [J], and below the change of the total, against time [s]."""
+    solution = reached(solution)
+    kinetic, potential = np.asarray(solution.kinetic_energy()), np.asarray(solution.potential_energy())
+    total = kinetic + potential
+    figure, (energies, change) = _panels("Energy", 2)
+    for label, values, colour in (("kinetic", kinetic, BLUE), ("potential", potential, VERMILION)):
+        energies.plot(solution.ts, values, color=colour, label=label)
+    energies.plot(solution.ts, total, color=INK, label="total", linestyle="--")
+    energies.set_ylabel("energy [J]")
+    _add_legend(figure, energies)
+    change.plot(solution.ts, total - total[0], color=INK)
+    change.set_ylabel("change of\ntotal energy [J]")
+    return figure
+
+
+def _panels(title, count):
+    figure = Figure(figsize=(7.0, 1.2 + 1.9 * count if count > 1 else 3.8), layout="constrained")
+    panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    panels[0].set_title(title)
+    panels[-1].set_xlabel("time [s]")
+    for panel in panels:
+        panel.grid(True, color="#E5E5E5")
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.margins(x=0.0)
+    return figure, panels
+
+
+def _present(values):
+    """Names of the components that are not negligible; all names where all components are zero."""
+    sizes = np.max(np.abs(np.asarray(values)), axis=0)
+    present = [name for name, size in zip("xyz", sizes, strict=True) if size > NEGLIGIBLE * max(sizes)]
+    return present or list("xyz")
+
+
+def _draw_components(panel, times, values, names):
+    for index, (name, colour) in enumerate(COMPONENT_COLOURS.items()):
+        if name in names:
+            panel.plot(times, np.asarray(values)[:, index], color=colour, label=name)
+
+
+def _hatch(panel, times, values, undetermined, names):
+    """Hatch the components that are not unique, down to zero."""
+    label = "not unique"
+    for index, (name, colour) in enumerate(COMPONENT_COLOURS.items()):
+        if name in names and np.any(undetermined[:, index]):
+            style = {"facecolor": "none", "edgecolor": colour, "alpha": 0.35, "hatch": "////", "linewidth": 0.0}
+            panel.fill_between(times, values[:, index], where=undetermined[:, index], label=label, **style)
+            label = None
+
+
+def _along(names):
+    """Words for the title where there is one component, and so no legend."""
+    return f" along {names[0]}" if len(names) == 1 else ""
+
+
+def _add_legend(figure, panel):
+    handles, labels = panel.get_legend_handles_labels()
+    if handles[1:] or labels[0] not in COMPONENT_COLOURS:
+        figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), frameon=False)
+    figure.align_ylabels()
