@@ -6,8 +6,10 @@ computes in single precision all the same. It also adds to `XLA_FLAGS` what lets
 see `linkax.xla.flags`; import linkax before JAX makes its first array.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from importlib import import_module as _import_module
+from types import ModuleType as _Module
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
 
 import jax
 
@@ -115,14 +117,25 @@ from linkax.studies.shooting import Shots as Shots  # noqa: E402
 from linkax.studies.shooting import shoot as shoot  # noqa: E402
 from linkax.studies.sweep import sweep as sweep  # noqa: E402
 from linkax.studies.sweep_result import Sweep as Sweep  # noqa: E402
-from linkax.view.page import View as View  # noqa: E402
 
-if TYPE_CHECKING:
+if _TYPE_CHECKING:
     from linkax import plot as plot
+    from linkax.view import View as View
+
+_LATER = {"plot": "linkax.plot", "View": "linkax.view"}  # with matplotlib, or SciPy
 
 
-def __getattr__(name: str) -> Any:
-    """Import `linkax.plot`, and matplotlib with it, when it is first used."""
-    if name == "plot":
-        return importlib.import_module("linkax.plot")
-    raise AttributeError(f"module 'linkax' has no attribute {name!r}")
+def __getattr__(name: str) -> _Any:
+    if name not in _LATER:
+        raise AttributeError(f"module 'linkax' has no attribute {name!r}")
+    module = _import_module(_LATER[name])
+    return getattr(module, name, module)
+
+
+def __dir__() -> list[str]:
+    here = [name for name, entry in globals().items() if not (name.startswith("_") or isinstance(entry, _Module))]
+    return sorted({*here, *_LATER})
+
+
+del jax, set_flags, watch_memory_maps
+__all__ = __dir__()  # pyright: ignore[reportUnsupportedDunderAll]

@@ -11,8 +11,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
 
 PER_FRONT = 100.0  # products that take as long as what a front costs however small it is
 
@@ -131,18 +129,28 @@ def _largest(sets, size):
 
 def _levels(sets, size):
     """The number of sets between each speed and an end of its part, (n,); parts one after the other."""
-    members = [(index, speed) for index, together in enumerate(sets) for speed in together]
-    members = np.array(members, dtype=np.int32).reshape(-1, 2)  # SciPy 1.14 finds shortest paths by no other integers
-    incidence = csr_array((np.ones(len(members)), members.T), shape=(len(sets), size))
-    graph, levels = (incidence.T @ incidence).tocsr(), np.zeros(size, dtype=int)
-    count, part = connected_components(graph, directed=False)
-    first = 0
-    for inside in (np.flatnonzero(part == index) for index in range(count)):
+    neighbours, levels, first = [set() for _ in range(size)], {}, 0
+    for members in sets:
+        for speed in members:
+            neighbours[speed] |= members
+    for start in range(size):
+        if start in levels:
+            continue
         # What is farthest from what is farthest lies at an end.
-        end = inside[0]
+        end, distances = start, {}
         for _ in range(3):
-            distance = dijkstra(graph, directed=False, unweighted=True, indices=end)[inside]
-            end = inside[np.argmax(distance)]
-        levels[inside] = first + distance
-        first = 1 + np.max(levels[inside])
-    return levels
+            distances = _distances(neighbours, end)
+            end = min(distances, key=lambda speed: (-distances[speed], speed))
+        levels |= {speed: first + distance for speed, distance in distances.items()}
+        first += 1 + distances[end]
+    return np.array([levels[speed] for speed in range(size)], dtype=int)
+
+
+def _distances(neighbours, start):
+    """{speed: steps to it} of all speeds that a start leads to."""
+    distances, front, distance = {}, {start}, 0
+    while front:
+        distances |= dict.fromkeys(front, distance)
+        front = set().union(*(neighbours[speed] for speed in front)) - distances.keys()
+        distance += 1
+    return distances

@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ellipj, ellipkinc
 
 from linkax.model.numbers import Number, Vector
 
@@ -35,6 +34,8 @@ def pendulum_angle(
 
     Whittaker, Analytical Dynamics of Particles and Rigid Bodies (4th ed.), section 44. Arguments: see `turned_link`.
     """
+    from scipy.special import ellipj, ellipkinc  # SciPy takes its time
+
     times = np.asarray(times, dtype=float)
     if stiffness == 0.0:
         return np.asarray(angle + speed * times)

@@ -3,13 +3,12 @@
 import os
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import optimistix as optx
 
 from linkax.model.numbers import number, require, require_type, whole_number
@@ -19,6 +18,11 @@ from linkax.studies.free_parameters import FreeParameters
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.parameters import as_arrays
 from linkax.studies.uncertainty import DEPENDENT, uncertainty
+
+if TYPE_CHECKING:
+    from optax import GradientTransformation
+else:
+    GradientTransformation = Any  # optax takes its time
 
 DEFAULT_STEPS = {"residual": 100, "loss": 1000}
 DEFAULT_TOLERANCE = 1e-6
@@ -36,7 +40,7 @@ def fit(
     params: Any,
     args: tuple | list = (),
     *,
-    optimiser: optx.AbstractLeastSquaresSolver | optax.GradientTransformation | None = None,
+    optimiser: optx.AbstractLeastSquaresSolver | GradientTransformation | None = None,
     steps: int | None = None,
     tolerance: int | float = DEFAULT_TOLERANCE,
     patience: int | None = None,
@@ -103,6 +107,8 @@ def _is_loss(function, free, args) -> bool:
 
 def _search_by(optimiser, function, free, mode, is_loss, tolerance) -> AbstractSearch:
     """The search of an optimiser, or of the default one."""
+    import optax
+
     if mode not in (None, "forward", "reverse"):
         raise ValueError(f"mode is {mode!r}; give 'forward', 'reverse', or None")
     if optimiser is None:

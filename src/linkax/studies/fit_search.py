@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 
@@ -115,6 +114,8 @@ class Descent(AbstractSearch):
         return self.solver.init(z)
 
     def step(self, z: Float[Array, " p"], state: Any, args: tuple, found: Evaluation) -> Step:
+        import optax
+
         def loss(z):
             value = self.flat(z, args)
             return value[0] if self.is_loss else 0.5 * jnp.sum(value**2)

@@ -3,11 +3,11 @@
 from collections.abc import Iterable
 from typing import Any
 
-from tqdm import tqdm
 
-
-def progress_bar(total: int, unit: str, progress: bool | None, **options: Any) -> tqdm:
+def progress_bar(total: int, unit: str, progress: bool | None, **options: Any) -> Any:
     """A progress bar that begins with compiling; with `progress` None it shows only in a terminal."""
+    from tqdm import tqdm
+
     disable = None if progress is None else not progress
     return tqdm(total=total, desc="compiling", unit=unit, disable=disable, **options)
 

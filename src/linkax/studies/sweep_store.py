@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import zarr
-from zarr.storage import MemoryStore
 
 from linkax.studies.files import synced, writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
@@ -39,7 +37,7 @@ class SweepStore(NamedTuple):
     path: Path
     sweep: str
     size: int
-    done: zarr.Array
+    done: Any
     arrays: tuple
 
     @staticmethod
@@ -73,6 +71,8 @@ class SweepStore(NamedTuple):
 
         **Raises:** `ValueError` where the folder holds another sweep.
         """
+        import zarr  # which takes its time, here and below
+
         sweep = fingerprint(program.text, [*jax.tree.leaves(params), order])
         identity = dict(format=FORMAT, members=len(order), chunk=program.size, sweep=sweep)
         files = _known_files(identity, program, params, order, not_run)
@@ -175,6 +175,9 @@ def _claim(path, identity, content):
 
 def _known_files(identity, program, params, order, not_run) -> dict[str, bytes]:
     """{path in the store: content} of all that a store holds before any chunk is done."""
+    import zarr
+    from zarr.storage import MemoryStore
+
     outputs, reason = program.outputs
     count, chunks = len(order), -(-len(order) // program.size)
     kept = {}

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
@@ -72,8 +71,10 @@ def uncertainty(
 
 def _ends(free, z, covariance, deviation, freedom, level):
     """(lower, upper) ends of the intervals, from Student's t distribution."""
+    from scipy.stats import t as student  # SciPy takes its time
+
     _, unravel = ravel_pytree(free.params(z))
-    times, ends = float(scipy.stats.t.ppf(0.5 + level / 2.0, freedom)), []
+    times, ends = float(student.ppf(0.5 + level / 2.0, freedom)), []
     for sign in (-1.0, 1.0):
         linear = np.asarray(free.vector(z)) + sign * times * np.sqrt(np.diagonal(covariance))
         moved = np.asarray(free.vector(z + sign * times * deviation))
