@@ -4,7 +4,7 @@ Five rods and six hinges have no mobility by count. It moves, as one of its loop
 """
 
 import linkax as lx
-from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.scenes.scene import Parameters, described
 
 # Positions of the hinges at the start, in lengths of a rod, and the axis of each.
 PLACES = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.0, -1.0, 1.0), (0.0, -1.0, 1.0), (0.0, 0.0, 1.0))
@@ -40,21 +40,8 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     return lx.assemble(mechanism, {"P1": parameters["angle"]}, {"P1": parameters["speed"]})
 
 
-BRICARD = Scene(
-    name="bricard",
-    summary="spatial six-bar loop with a constraint that is always redundant (A04 of the LIM/IFToMM library)",
-    parameters={"length": 1.0, "width": 0.1, "mass": 1.0, "gravity": 9.81, "angle": 0.0, "speed": 0.0},
-    meanings={
-        "length": "of every rod [m]",
-        "width": "of the rods' square section [m]",
-        "mass": "of every rod [kg]",
-        "gravity": "along -y [m/s²]",
-        "angle": "of hinge P1 from the library's start, at the start [rad]",
-        "speed": "of that angle, at the start [rad/s]",
-    },
-    variants={"A04": Variant("released from rest, folded at right angles")},
-    default_variant="A04",
-    t1=10.0,
+BRICARD = described(
+    "bricard",
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"P3": ("rod_2", "tip")},

@@ -3,14 +3,12 @@
 Zhao, Qi, Wang, Xu, Applied Mathematics and Mechanics 47(8), 2026, doi 10.21656/1000-0887.450230.
 """
 
-import math
-
 import jax
 import jax.numpy as jnp
 
 import linkax as lx
 from linkax.model.numbers import Number
-from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.scenes.scene import Parameters, described
 from linkax.xla.arrays import Scalar
 
 
@@ -59,52 +57,8 @@ def _rod(crank: Number, rod: Number, angle: Number, speed: Number) -> tuple[Scal
     return inclination, -speed * along_crank / along_rod, along_crank + along_rod
 
 
-CRANK_SLIDER = Scene(
-    name="crank-slider",
-    summary="planar crank-slider, with equal lengths unless set otherwise (example a of the paper)",
-    parameters={
-        "crank": 1.0,
-        "rod": 1.0,
-        "crank_mass": 1.0,
-        "rod_mass": 1.0,
-        "slider_mass": 1.0,
-        "gravity": 9.81,
-        "torque": 0.0,
-        "angle": 0.0,
-        "speed": 0.0,
-    },
-    meanings={
-        "crank": "length of the crank [m]",
-        "rod": "length of the connecting rod [m]",
-        "crank_mass": "mass of the crank, a uniform slender rod [kg]",
-        "rod_mass": "mass of the connecting rod, a uniform slender rod [kg]",
-        "slider_mass": "mass of the slider [kg]",
-        "gravity": "along -y [m/s²]",
-        "torque": "on the crank, constant [N m]",
-        "angle": "of the crank from +x, at the start [rad]",
-        "speed": "of the crank, at the start [rad/s]",
-    },
-    variants={
-        "SC1": Variant("released from rest, stretched, under gravity; swings through the singular position"),
-        "SC2": Variant("turns without gravity", {"gravity": 0.0, "angle": math.pi / 4, "speed": 2.0}),
-        "SC3": Variant("turns under gravity", {"speed": 8.0}),
-        "SC4": Variant("swings from rest at 60 degrees under gravity", {"angle": math.pi / 3}),
-        "regular": Variant(
-            "rod three times the crank, driven by a torque from rest: no singular position",
-            {
-                "crank": 0.1,
-                "rod": 0.3,
-                "crank_mass": 0.2,
-                "rod_mass": 0.2,
-                "slider_mass": 0.4,
-                "gravity": 0.0,
-                "torque": 0.1,
-            },
-            t1=3.0,
-        ),
-    },
-    default_variant="SC1",
-    t1=10.0,
+CRANK_SLIDER = described(
+    "crank-slider",
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"slider": ("slider", None)},

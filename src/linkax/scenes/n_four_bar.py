@@ -3,14 +3,12 @@
 Where all links are in line it has N + 1 degrees of freedom for a moment.
 """
 
-import math
-
 import numpy as np
 
 import linkax as lx
 from linkax.model.numbers import Number
 from linkax.scenes.closed_form import turned_link
-from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.scenes.scene import Parameters, described
 from linkax.xla.arrays import Array
 
 
@@ -57,23 +55,8 @@ def _exact(parameters: Parameters, times: Array) -> dict[str, np.ndarray] | None
     return None if link is None else {"B0": length * link}
 
 
-N_FOUR_BAR = Scene(
-    name="n-four-bar",
-    summary="row of N parallelogram four-bars (A02 of the LIM/IFToMM library)",
-    parameters={"N": 2, "length": 1.0, "mass": 1.0, "gravity": 9.81, "angle": math.pi / 2, "speed": -1.0},
-    meanings={
-        "N": "number of four-bars",
-        "length": "of every link [m]",
-        "mass": "of every link, a uniform slender rod [kg]",
-        "gravity": "along -y [m/s²]",
-        "angle": "of the vertical links from +x, at the start [rad]",
-        "speed": "of that angle, at the start [rad/s]; -1 moves B0 at +1 m/s where the links are upright",
-    },
-    variants={
-        "A02": Variant("upright, B0 at 1 m/s, under gravity"),
-    },
-    default_variant="A02",
-    t1=10.0,
+N_FOUR_BAR = described(
+    "n-four-bar",
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"B0": ("link_0", "tip")},

@@ -4,7 +4,7 @@ import numpy as np
 
 import linkax as lx
 from linkax.scenes.closed_form import turned_link
-from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.scenes.scene import Parameters, described
 from linkax.xla.arrays import Array
 
 
@@ -28,20 +28,8 @@ def _exact(parameters: Parameters, times: Array) -> dict[str, np.ndarray] | None
     return None if link is None else {"bob": length * link}
 
 
-PENDULUM = Scene(
-    name="pendulum",
-    summary="point mass on a massless link (A01 of the LIM/IFToMM library)",
-    parameters={"length": 1.0, "mass": 1.0, "gravity": 9.81, "angle": 0.0, "speed": 0.0},
-    meanings={
-        "length": "from the pivot to the mass [m]",
-        "mass": "of the bob [kg]",
-        "gravity": "along -y [m/s²]",
-        "angle": "of the link from +x, at the start [rad]",
-        "speed": "of that angle, at the start [rad/s]",
-    },
-    variants={"A01": Variant("released from rest, horizontal")},
-    default_variant="A01",
-    t1=10.0,
+PENDULUM = described(
+    "pendulum",
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"bob": ("link", "bob")},

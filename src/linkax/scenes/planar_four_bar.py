@@ -7,7 +7,7 @@ import math
 
 import linkax as lx
 from linkax.model.numbers import Number
-from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.scenes.scene import Parameters, described
 
 
 def _mechanism(parameters: Parameters) -> lx.Mechanism:
@@ -36,34 +36,8 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     return lx.assemble(mechanism, {"P1": parameters["angle"]}, {"P1": parameters["speed"]}, guess=guess)
 
 
-PLANAR_FOUR_BAR = Scene(
-    name="planar-four-bar",
-    summary="four-bar of massless links with two particles (textbook Learn Multibody Dynamics)",
-    parameters={
-        "a": 0.8,
-        "b": 2.0,
-        "c": 1.0,
-        "ground": 2.0,
-        "mass_2": 1.0,
-        "mass_3": 1.0,
-        "gravity": 9.81,
-        "angle": math.radians(10.0),
-        "speed": 0.0,
-    },
-    meanings={
-        "a": "length of the first link, from P1 to P2 [m]",
-        "b": "length of the second link, from P2 to P3 [m]",
-        "c": "length of the third link, from P3 to P4 [m]",
-        "ground": "from P1 to P4 [m]",
-        "mass_2": "of the particle at P2 [kg]",
-        "mass_3": "of the particle at P3 [kg]",
-        "gravity": "along -y [m/s²]",
-        "angle": "of the first link from +x, at the start [rad]",
-        "speed": "of that angle, at the start [rad/s]",
-    },
-    variants={"textbook": Variant("released from rest at 10 degrees")},
-    default_variant="textbook",
-    t1=10.0,
+PLANAR_FOUR_BAR = described(
+    "planar-four-bar",
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"P2": ("link_a", "tip"), "P3": ("link_b", "tip")},

@@ -3,13 +3,11 @@
 Three sections slide in each other. A rope makes the third one follow the second, and a cylinder luffs the boom.
 """
 
-import math
-
 import jax.numpy as jnp
 
 import linkax as lx
 from linkax.model.numbers import Number
-from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.scenes.scene import Parameters, described
 from linkax.xla.arrays import Scalar
 
 SECTION = 10.0  # length of each section [m]
@@ -70,42 +68,8 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     return lx.assemble(mechanism, {"boom": angle, "slide_2": slide}, {"boom": 0.0, "slide_2": 0.0}, guess=guess)
 
 
-RIGID_CRANE = Scene(
-    name="rigid-crane",
-    summary="luffing telescopic crane of rigid sections, coupled by a rope (for example c of the paper)",
-    parameters={
-        "mass_1": 1200.0,
-        "mass_2": 900.0,
-        "mass_3": 600.0,
-        "payload": 2000.0,
-        "gravity": 9.81,
-        "luffing_stiffness": 2e7,
-        "luffing_damping": 2e5,
-        "luffing_angle": math.pi / 3,
-        "telescope_stiffness": 5e5,
-        "telescope_damping": 2e4,
-        "telescope_rest": 3.0,
-        "angle": math.pi / 3,
-        "extension": 1.0,
-    },
-    meanings={
-        "mass_1": "of the base section, 10 m long [kg]",
-        "mass_2": "of the second section, 10 m long [kg]",
-        "mass_3": "of the third section, 10 m long [kg]",
-        "payload": "mass at the tip [kg]",
-        "gravity": "along -y [m/s²]",
-        "luffing_stiffness": "of the luffing cylinder [N/m]",
-        "luffing_damping": "of the luffing cylinder [N s/m]",
-        "luffing_angle": "of the boom where the luffing cylinder carries nothing [rad]",
-        "telescope_stiffness": "of the telescoping cylinder [N/m]",
-        "telescope_damping": "of the telescoping cylinder [N s/m]",
-        "telescope_rest": "extension where the telescoping cylinder carries nothing [m]",
-        "angle": "of the boom from +x, at the start [rad]",
-        "extension": "of each section beyond 1 m, at the start [m]",
-    },
-    variants={"reference": Variant("released from rest, retracted")},
-    default_variant="reference",
-    t1=5.0,
+RIGID_CRANE = described(
+    "rigid-crane",
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"tip": ("section_3", "tip")},

@@ -1,9 +1,14 @@
-"""Scenes: mechanisms as functions of named parameters, with their initial states."""
+"""Scenes: mechanisms as functions of named parameters, with their initial states.
+
+What describes a scene is in `scenes.toml`, which the command line lists without waiting for JAX.
+"""
 
 import dataclasses
 import math
 import operator
+import tomllib
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +18,7 @@ from linkax.simulation.start.state import State
 from linkax.xla.tracing import concrete
 
 Parameters = Mapping[str, Any]  # numbers, some of them traced
+_DESCRIBED = tomllib.loads((Path(__file__).parent / "scenes.toml").read_text(encoding="utf-8"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +105,22 @@ class Scene:
             kind = "an integer of at least 1" if read is _count else "a finite number"
             message = f"parameter {name!r} of scene {self.name!r} is {entry!r}; it must be {kind}"
             raise ValueError(message) from error
+
+
+def described(name: str, **functions: Any) -> Scene:
+    """The scene of that name in `scenes.toml`, with its functions: `mechanism`, `initial`, `points`, `exact`."""
+    entry = _DESCRIBED[name]
+    variants = {name: Variant(**variant) for name, variant in entry["variants"].items()}
+    return Scene(
+        name=name,
+        summary=entry["summary"],
+        parameters={name: default for name, (default, _) in entry["parameters"].items()},
+        meanings={name: meaning for name, (_, meaning) in entry["parameters"].items()},
+        variants=variants,
+        default_variant=next(iter(variants)),
+        t1=entry["t1"],
+        **functions,
+    )
 
 
 def _count(entry: Any) -> int:

@@ -5,13 +5,11 @@ neither lengths nor masses; these are ours. Three constraints are always redunda
 line.
 """
 
-import math
-
 import numpy as np
 
 import linkax as lx
 from linkax.scenes.closed_form import turned_link
-from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.scenes.scene import Parameters, described
 from linkax.xla.arrays import Array
 
 
@@ -44,27 +42,8 @@ def _exact(parameters: Parameters, times: Array) -> dict[str, np.ndarray] | None
     return None if link is None else {"C": length * (link + np.array([1.0, 0.0, 0.0]))}
 
 
-SPATIAL_FOUR_LINK = Scene(
-    name="spatial-four-link",
-    summary="rhombus of spatial hinges, with redundant constraints and singular positions (example b of the paper)",
-    parameters={"length": 1.0, "mass": 1.0, "gravity": 0.0, "angle": math.pi / 2, "speed": 1.0},
-    meanings={
-        "length": "of every link [m]",
-        "mass": "of every link, a uniform slender rod [kg]",
-        "gravity": "along -y [m/s²]",
-        "angle": "of the crank from +x, at the start [rad]",
-        "speed": "of that angle, at the start [rad/s]",
-    },
-    variants={
-        "FL1": Variant("turns uniformly from upright, without gravity"),
-        "FL2": Variant("turns uniformly from the singular position, without gravity", {"angle": 0.0}),
-        "FL3": Variant("turns under gravity from upright", {"gravity": 9.81, "speed": -1.0}),
-        "FL4": Variant(
-            "turns under gravity from the singular position", {"gravity": 9.81, "angle": 0.0, "speed": -1.0}
-        ),
-    },
-    default_variant="FL1",
-    t1=20.0,
+SPATIAL_FOUR_LINK = described(
+    "spatial-four-link",
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"C": ("coupler", "tip")},

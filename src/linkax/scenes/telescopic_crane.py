@@ -8,7 +8,6 @@ load hangs on a rope from the tip.
 Sizes are about those of a mobile crane for 30 tonnes, from no data sheet.
 """
 
-import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import linkax as lx
 from linkax.model.bodies import BodyOrFrame
 from linkax.model.numbers import Number
-from linkax.scenes.scene import Parameters, Scene, Variant
+from linkax.scenes.scene import Parameters, described
 from linkax.xla.arrays import Scalar
 
 SECTION = 10.0  # length of each section [m]
@@ -145,57 +144,8 @@ def _initial(mechanism: lx.Mechanism, parameters: Parameters) -> lx.State:
     return lx.equilibrium(before, lx.assemble(before, guess=guess))
 
 
-TELESCOPIC_CRANE = Scene(
-    name="telescopic-crane",
-    summary="crane with a boom of three sections that bend and slide in each other (example c of the paper)",
-    parameters={
-        "modulus": 2.1e11,
-        "wall": 0.008,
-        **{f"height_{index}": size for index, size in ((1, 0.7), (2, 0.6), (3, 0.5))},
-        **{f"width_{index}": size for index, size in ((1, 0.5), (2, 0.44), (3, 0.38))},
-        "damping": 2e-3,
-        "elements": 2,
-        "planes": 1,
-        "payload": 2000.0,
-        "dropped": 0.0,
-        "hoist": 5.0,
-        "gravity": 9.81,
-        "duration": 8.0,
-        "slew": 0.0,
-        "slew_change": 0.0,
-        "angle": math.pi / 3,
-        "angle_change": 0.0,
-        "extension": 6.0,
-        "extension_change": 0.0,
-    },
-    meanings={
-        "modulus": "Young's modulus of the sections [Pa]",
-        "wall": "thickness of their walls [m]",
-        **{f"height_{index}": f"of section {index} [m]" for index in (1, 2, 3)},
-        **{f"width_{index}": f"of section {index} [m]" for index in (1, 2, 3)},
-        "damping": "time by which strain rates count as strains [s]",
-        "elements": "of each section",
-        "planes": "1: the boom bends in the luffing plane; 2: sideways too, and it twists",
-        "payload": "mass on the hook [kg]",
-        "dropped": "mass that hangs there too until t = 0 [kg]",
-        "hoist": "length of the hoist rope [m]",
-        "gravity": "along -y [m/s²]",
-        "duration": "of all changes, from t = 0 on [s]",
-        "slew": "angle of the turntable, at the start [rad]",
-        "slew_change": "what it turns [rad]",
-        "angle": "of the boom from the horizontal, unbent, at the start [rad]",
-        "angle_change": "what the luffing cylinder lifts it [rad]",
-        "extension": "of each section out of the one before, at the start, less than 8 [m]",
-        "extension_change": "what the telescoping cylinder and the rope push out each, to less than 8 in all [m]",
-    },
-    variants={
-        "release": Variant("the load drops", {"payload": 100.0, "dropped": 1900.0}),
-        "luffing": Variant("lifted by 15 degrees", {"angle": math.pi / 4, "angle_change": math.pi / 12}, t1=10.0),
-        "telescoping": Variant("pushed out under load", {"extension": 4.0, "extension_change": 3.0}, t1=10.0),
-        "slewing": Variant("turned by 45 degrees", {"planes": 2, "slew_change": math.pi / 4}, t1=10.0),
-    },
-    default_variant="release",
-    t1=3.0,
+TELESCOPIC_CRANE = described(
+    "telescopic-crane",
     mechanism=_mechanism,
     initial=_initial,
     points=lambda parameters: {"tip": ("section_3", "tip"), "load": ("payload", None)},
