@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from linkax.cli import main
-from linkax.cli.compare import EQUAL
-from linkax.cli.options import PRESETS, SOLVERS
 from linkax.formulations.named import COMPARED
 from linkax.scenes import SCENES
+from linkax_command import run
+from linkax_command.parser import EQUAL, PRESETS, SOLVERS
 
 texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=8)
 NO_SIZE = ["", "0", "-1", "nan", "inf", "-inf", "1e999", "1,5", "0x10", "one", "1e", "None", "[1]", "1j"]
@@ -45,7 +44,7 @@ def refused(arguments, capsys, folder, *words):
     """Run a command line, and check that it is refused."""
     before = sorted(folder.rglob("*"))
     capsys.readouterr()
-    assert main([*arguments, "--no-plots"]) == 2, arguments
+    assert run([*arguments, "--no-plots"]) == 2, arguments
     printed = capsys.readouterr()
     assert printed.out == ""
     *progress, line = printed.err.splitlines()

@@ -1,13 +1,20 @@
 """The command line, as a user meets it."""
 
 import json
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from linkax.cli import main, options
+import linkax_command
+from linkax.cli import options
+from linkax.formulations.named import BASES
+from linkax_command import parser, run
 
 KEYS = {
     "scene", "variant", "t1", "preset", "steps", "compile_s", "run_s", "position_violation",
@@ -38,7 +45,7 @@ BAD = {
     "simulate pendulum --rtol nan": "not a positive",
     "simulate pendulum --t1 -3": "positive, finite",
     "simulate crank-slider --set rod=0.5 --set angle=1.5": "joint 'wrist_pin' does not close: a gap of",
-    "fly": "invalid choice",
+    "fly": "unknown command 'fly'; known: list, simulate, compare",
     "": "COMMAND",
 }
 
@@ -46,7 +53,7 @@ BAD = {
 @pytest.mark.parametrize("command", BAD)
 def test_bad_input_is_one_line_and_code_two(command, capsys, tmp_path):
     out = ["--out", str(tmp_path), "--no-plots"] if command.startswith(("simulate", "compare")) else []
-    assert main([*command.split(), *out]) == 2
+    assert run([*command.split(), *out]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     *progress, line = printed.err.strip().splitlines()
@@ -54,8 +61,51 @@ def test_bad_input_is_one_line_and_code_two(command, capsys, tmp_path):
     assert progress in ([], ["assembling ..."])
 
 
+LIGHT = {
+    "--help": (0, "simulate"),
+    "--version": (0, "linkax 0.1.0, jax "),
+    "list": (0, "variant SC1 (default): "),
+    "simulate crank-slidr": (2, "(did you mean 'crank-slider'?); known: pendulum"),
+    "simulatte": (2, "unknown command 'simulatte' (did you mean 'simulate'?); known: list"),
+    "compare pendulum --solver dopri": (2, "(did you mean 'dopri8'?)"),
+}
+ANSWER = """
+import sys
+from linkax_command import run
+try:
+    code = run(sys.argv[1:])
+except SystemExit as ended:
+    code = ended.code
+print("waits for JAX" if "jax" in sys.modules else "at once")
+sys.exit(code)
+"""
+
+
+@pytest.mark.parametrize("command", LIGHT)
+def test_what_computes_nothing_does_not_wait_for_jax(command):
+    environment = os.environ | {"PYTHONPATH": str(Path(linkax_command.__file__).parents[1])}
+    asked = [sys.executable, "-c", ANSWER, *command.split()]
+    found = subprocess.run(asked, capture_output=True, text=True, env=environment, check=False)
+    code, words = LIGHT[command]
+    assert found.returncode == code
+    assert words in (found.stderr if code else found.stdout)
+    assert found.stdout.endswith("at once\n")
+
+
+def test_python_m_linkax_is_the_command():
+    environment = os.environ | {"PYTHONPATH": str(Path(linkax_command.__file__).parents[1])}
+    asked = [sys.executable, "-m", "linkax", "--version"]
+    assert "linkax 0.1.0" in subprocess.run(asked, capture_output=True, text=True, env=environment, check=True).stdout
+
+
+def test_the_parser_names_what_there_is():
+    assert set(parser.SOLVERS) == set(options.SOLVERS)
+    for name in BASES:
+        assert name in parser.FORMULATIONS
+
+
 def test_list_names_everything(capsys):
-    assert main(["list"]) == 0
+    assert run(["list"]) == 0
     printed = capsys.readouterr().out
     for word in ("pendulum", "crank-slider", "n-four-bar", "SC4", "A02", "FL2", "N = 2", "slider_mass"):
         assert word in printed
@@ -63,7 +113,7 @@ def test_list_names_everything(capsys):
 
 def test_json_is_one_object_and_files_are_whole(capsys, tmp_path):
     command = ["simulate", "pendulum", "--t1", "2", "--preset", "draft", "--out", str(tmp_path), "--json"]
-    assert main(command) == 0
+    assert run(command) == 0
     printed = capsys.readouterr().out
     found = json.loads(printed)
     assert printed.count("\n") == 1
@@ -93,7 +143,7 @@ def test_json_is_one_object_and_files_are_whole(capsys, tmp_path):
 def test_summary_for_people(capsys, tmp_path):
     command = ["simulate", "pendulum", "--t1", "2", "--preset", "draft", "--out", str(tmp_path), "--no-plots"]
     (tmp_path / "trajectory-interrupted.npz").write_text("of an earlier run")
-    assert main(command) == 0
+    assert run(command) == 0
     printed = capsys.readouterr().out
     for word in ("successful", "steps", "compile time", "run time", "position violation", "energy change", "bob"):
         assert word in printed
@@ -104,8 +154,8 @@ def test_compare_prints_verdicts_and_keeps_them(capsys, tmp_path, monkeypatch):
     names = "tangent-space,lagrange-multipliers,moore-penrose-svd+partitioning"
     command = ["compare", "pendulum", "--t1", "2", "--formulations", names, "--out", str(tmp_path)]
     kept = []
-    monkeypatch.setattr(options, "at_interrupt", lambda keep: kept.append(keep()))
-    assert main(command) == 0
+    monkeypatch.setattr(linkax_command, "at_interrupt", lambda keep: kept.append(keep()))
+    assert run(command) == 0
     part = f"what was compared is in {tmp_path / 'comparison-interrupted.json'}"
     assert kept == ["", part, part, part, f"the comparison is in {tmp_path / 'comparison.json'}"]
     assert {path.name for path in tmp_path.iterdir()} == {"comparison.json", "comparison.png"}
@@ -132,7 +182,7 @@ BOTH = "lagrange-multipliers,lagrange-multipliers+projection"
 
 @pytest.mark.slow
 def test_compare_at_equal_cost_chooses_among_tolerances(capsys, tmp_path):
-    assert main([*SC2, BOTH, "--t1", "0.4", "--equal", "cost", "--out", str(tmp_path), "--json", "--no-plots"]) == 0
+    assert run([*SC2, BOTH, "--t1", "0.4", "--equal", "cost", "--out", str(tmp_path), "--json", "--no-plots"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [trial["formulation"] for trial in found["trials"]] == ["tangent-space", *BOTH.split(",")]
     assert found["trials"][0]["run_s"] <= found["budget_s"]
@@ -144,7 +194,7 @@ def test_compare_at_equal_cost_chooses_among_tolerances(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_compare_tells_when_a_formulation_left_the_motion(capsys, tmp_path):
-    assert main([*SC2, BOTH, "--t1", "0.7", "--out", str(tmp_path), "--no-plots"]) == 0
+    assert run([*SC2, BOTH, "--t1", "0.7", "--out", str(tmp_path), "--no-plots"]) == 0
     printed = capsys.readouterr().out
     left, stayed = json.loads((tmp_path / "comparison.json").read_text())["trials"]
     assert (stayed["verdict"], stayed["diverged_at"], stayed["why"]) == ("converged", None, "")

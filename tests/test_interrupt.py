@@ -21,6 +21,7 @@ SOON = 5.0
 HEARS = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"  # background jobs may not
 COMMAND = [sys.executable, "-c", f"{HEARS}; from linkax_command import main; sys.exit(main())"]
 SOURCE = Path(lx.__file__).parents[1]
+SIMULATE = ["simulate", "pendulum"]
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="a process cannot be sent Ctrl-C alone")
 
@@ -28,7 +29,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="a process cannot be 
 def interrupted(arguments, path, *, after="", wait=0.0, times=1):
     """Exit code and lines of a command that gets Ctrl-C some time after the line that contains `after`."""
     environment = os.environ | {"PYTHONPATH": str(path), "PYTHONUNBUFFERED": "1"}
-    environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # so that compiling takes the same time whatever ran before
+    environment["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # compiling takes the same time whatever ran before
     process = subprocess.Popen([*COMMAND, *arguments], stderr=subprocess.PIPE, text=True, env=environment)
     watch = threading.Timer(LIMIT, process.kill)
     watch.start()
@@ -51,7 +52,8 @@ def stands_in(folder, program):
     (folder / "linkax" / "cli").mkdir(parents=True)
     (folder / "linkax" / "__init__.py").write_text("")
     (folder / "linkax" / "cli" / "__init__.py").write_text(program)
-    (folder / "linkax_command.py").symlink_to(SOURCE / "linkax_command.py")
+    (folder / "linkax" / "scenes").symlink_to(SOURCE / "linkax" / "scenes")
+    (folder / "linkax_command").symlink_to(SOURCE / "linkax_command")
     return folder
 
 
@@ -59,13 +61,13 @@ READY = "import hashlib, sys, time\nready = lambda: print('ready', file=sys.stde
 COMPUTES = "hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)"  # one call, deaf to signals, as XLA's are
 MOMENTS = {
     "while importing": f"ready()\n{COMPUTES}",
-    "in a call": f"def main():\n    ready()\n    {COMPUTES}",
-    "between calls": "def main():\n    ready()\n    while True:\n        pass",
+    "in a call": f"def run(*_):\n    ready()\n    {COMPUTES}",
+    "between calls": "def run(*_):\n    ready()\n    while True:\n        pass",
     "where errors are swallowed": """
 class Deaf:
     def __del__(self):
         time.sleep(100.0)
-def main():
+def run(*_):
     ready()
     while True:
         try:
@@ -78,10 +80,10 @@ def main():
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_ctrl_c_ends_the_command_with_one_line(moment, tmp_path):
     path = stands_in(tmp_path, READY + MOMENTS[moment])
-    assert interrupted([], path, after="ready", wait=0.1) == (130, ["linkax: interrupted"])
+    assert interrupted(SIMULATE, path, after="ready", wait=0.1) == (130, ["linkax: interrupted"])
 
 
-KEEPS = "from linkax_command import at_interrupt\ndef main():\n    at_interrupt({})\n    ready()\n    " + COMPUTES
+KEEPS = "def run(_, at_interrupt):\n    at_interrupt({})\n    ready()\n    " + COMPUTES
 
 
 @pytest.mark.parametrize(
@@ -93,18 +95,21 @@ KEEPS = "from linkax_command import at_interrupt\ndef main():\n    at_interrupt(
 )
 def test_what_was_computed_is_kept(keep, line, tmp_path):
     path = stands_in(tmp_path, READY + KEEPS.format(keep))
-    assert interrupted([], path, after="ready", wait=0.1) == (130, ["linkax: interrupted" + line])
+    assert interrupted(SIMULATE, path, after="ready", wait=0.1) == (130, ["linkax: interrupted" + line])
 
 
 def test_twice_ends_at_once(tmp_path):
     path = stands_in(tmp_path, READY + KEEPS.format("lambda: time.sleep(1000.0)"))
-    assert interrupted([], path, after="ready", wait=0.3, times=2) == (130, [])
+    assert interrupted(SIMULATE, path, after="ready", wait=0.3, times=2) == (130, [])
 
 
 @pytest.mark.parametrize("code", [0, 1, 2])
 def test_a_command_that_ends_by_itself_has_its_own_code(code, tmp_path):
-    path = stands_in(tmp_path, f"def main():\n    return {code}")
-    assert subprocess.run(COMMAND, env=os.environ | {"PYTHONPATH": str(path)}, check=False).returncode == code
+    path = stands_in(tmp_path, f"def run(*_):\n    return {code}")
+    assert (
+        subprocess.run([*COMMAND, *SIMULATE], env=os.environ | {"PYTHONPATH": str(path)}, check=False).returncode
+        == code
+    )
 
 
 def test_files_that_were_being_written_are_removed(tmp_path):
@@ -142,7 +147,7 @@ def test_a_comparison_keeps_its_trials_apart_from_a_whole_one(tmp_path):
 
 
 def test_ctrl_c_while_linkax_is_imported():
-    assert interrupted(["list"], SOURCE, wait=0.5) == (130, ["linkax: interrupted"])
+    assert interrupted(SIMULATE, SOURCE, wait=0.5) == (130, ["linkax: interrupted"])
 
 
 PENDULUM = ["simulate", "pendulum", "--t1", "2", "--preset", "draft"]

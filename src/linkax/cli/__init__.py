@@ -1,3 +1,3 @@
-"""The command line: `linkax list`, `linkax simulate SCENE`, `linkax compare SCENE`."""
+"""What the commands `linkax simulate` and `linkax compare` compute; `linkax_command` reads what they are asked."""
 
-from linkax.cli.main import main as main
+from linkax.cli.main import run as run

@@ -1,25 +1,24 @@
 """The command `linkax compare SCENE`, which compares formulations."""
 
+import argparse
 import json
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from linkax.cli.options import (
+    AtInterrupt,
     RunOptions,
-    add_run_options,
     at_interrupt_in,
     end_progress,
-    one_of,
     output_folder,
-    positive,
     progress,
     steps_in_words,
     write_json,
 )
 from linkax.cli.report import finite
 from linkax.formulations.formulation import AbstractFormulation
-from linkax.formulations.named import BASES, COMPARED, TANGENT_SPACE, formulation
+from linkax.formulations.named import COMPARED, TANGENT_SPACE, formulation
 from linkax.studies.comparison import TIGHTEST, Stepping, at_equal_cost, compare
 from linkax.studies.comparison_result import Comparison, Trial
 from linkax.studies.files import written_whole
@@ -42,27 +41,7 @@ HEADER: tuple[str, ...] = (
 EQUAL = {"tolerance": "each at the same tolerance or step", "cost": "each in no more run time than the paper's needs"}
 
 
-def add_command(commands: Any) -> None:
-    """Add the command to a parser's subparsers."""
-    parser = commands.add_parser(
-        "compare",
-        help="integrate a scene by all formulations, and compare errors, violations and cost",
-        epilog=f"A NAME is {TANGENT_SPACE} (the paper's), or one of {', '.join(BASES)}, with "
-        "+baumgarte added, and +partitioning or +projection.",
-    )
-    parser.set_defaults(command=_compare)
-    add_run_options(parser)
-    names = "formulations, separated by commas (default: sixteen, about two minutes, most of it compiling)"
-    parser.add_argument("--formulations", default=",".join(COMPARED), metavar="NAME,...", help=names)
-    equal = "; ".join(f"{name}: {meaning}" for name, meaning in EQUAL.items())
-    parser.add_argument("--equal", default="tolerance", type=one_of(EQUAL), metavar="WHAT", help=equal)
-    parser.add_argument("--bound", type=positive, metavar="M", help="an error above it [m] counts as diverged")
-    parser.add_argument(
-        "--all-rows", action="store_true", help="with the loop rows too that no motion changes, which linkax leaves out"
-    )
-
-
-def _compare(arguments) -> int:
+def run_compare(arguments: argparse.Namespace, at_interrupt: AtInterrupt) -> int:
     """Compare, write the files, print the verdicts, and return the exit code."""
     asked, chosen = RunOptions(arguments), _chosen(arguments)
     mechanism = asked.mechanism.with_all_rows() if arguments.all_rows else asked.mechanism
@@ -73,7 +52,7 @@ def _compare(arguments) -> int:
         "all_rows": arguments.all_rows,
     }
     out = output_folder(arguments.out, f"compare-{asked.scene.name}", settings, ("comparison.json", PART))
-    at_interrupt_in(out)
+    at_interrupt_in(at_interrupt, out)
     exact = asked.scene.exact
     comparison = compare(
         mechanism,
@@ -85,11 +64,11 @@ def _compare(arguments) -> int:
         exact=None if exact is None else lambda times: exact(asked.parameters, times),
         bound=arguments.bound,
         report=progress,
-        keep=lambda comparison: at_interrupt_in(out, partial(keep, out, settings, comparison)),
+        keep=lambda comparison: at_interrupt_in(at_interrupt, out, partial(keep, out, settings, comparison)),
     )
     trials, budget = _trials_at_equal(comparison, asked, arguments)
     described = settings | {"budget_s": budget} | _described(comparison, trials)
-    files = _write(out, described, None if arguments.no_plots else comparison)
+    files = _write(at_interrupt, out, described, None if arguments.no_plots else comparison)
     end_progress()
     if arguments.json:
         print(json.dumps(described, allow_nan=False))
@@ -98,11 +77,11 @@ def _compare(arguments) -> int:
     return 0
 
 
-def _write(out, described, plotted) -> list[Path]:
+def _write(at_interrupt, out, described, plotted) -> list[Path]:
     """Write the results, and the figure of a comparison where there is one to plot; returns the files."""
     files = [out / "comparison.json"]
     write_json(files[0], described)
-    at_interrupt_in(out, lambda: f"the comparison is in {files[0]}")
+    at_interrupt_in(at_interrupt, out, lambda: f"the comparison is in {files[0]}")
     (out / PART).unlink(missing_ok=True)
     if plotted is not None:
         from linkax.plot.comparison import comparison  # matplotlib takes its time
@@ -115,7 +94,8 @@ def _write(out, described, plotted) -> list[Path]:
 
 def _chosen(arguments) -> dict[str, AbstractFormulation]:
     """{name: formulation} of those asked for; at equal cost the paper's, which sets the cost, is among them."""
-    names = [name.strip() for name in arguments.formulations.split(",")]
+    asked = arguments.formulations
+    names = [*COMPARED] if asked is None else [name.strip() for name in asked.split(",")]
     if arguments.equal == "cost":
         names = [TANGENT_SPACE, *names]
     return {name: formulation(name) for name in names}

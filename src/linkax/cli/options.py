@@ -3,7 +3,6 @@
 import argparse
 import itertools
 import json
-import math
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -17,34 +16,17 @@ from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.rosenbrock import Rodas5P
 from linkax.simulation.integrate.runge_kutta import RungeKutta4
 from linkax.studies.files import remove_unfinished, writable_folder, written_whole
-from linkax_command import at_interrupt
 
-PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
 OF_DIFFRAX = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno5")
 SOLVERS = {name.lower(): getattr(diffrax, name) for name in OF_DIFFRAX} | {
     "rodas5p": Rodas5P,
     "rk4": RungeKutta4,
 }
-
-
-def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a run: the scene, its parameters, and how it is integrated."""
-    parser.add_argument("scene", metavar="SCENE", help="a scene of `linkax list`")
-    parser.add_argument("--variant", help="a variant of the scene (default: its first)")
-    parser.add_argument("--t1", type=positive, metavar="S", help="end time [s]")
-    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="NAME=VALUE", help="a parameter")
-    parser.add_argument("--preset", default="balanced", type=one_of(PRESETS), help=f"{', '.join(PRESETS)}")
-    parser.add_argument("--rtol", type=positive, metavar="X", help="tolerance of a step, instead of the preset's")
-    solvers = f"{', '.join(SOLVERS)} (default: dopri8, or rodas5p for damped beams)"
-    parser.add_argument("--solver", type=one_of(SOLVERS), help=solvers)
-    parser.add_argument("--dt", type=positive, metavar="S", help="fixed steps [s], instead of ones that adapt")
-    parser.add_argument("--out", type=_path, metavar="DIR", help="folder for the files (default: under linkax-out)")
-    parser.add_argument("--no-plots", action="store_true", help="write no pictures")
-    parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
+AtInterrupt = Callable[[Callable[[], str]], None]
 
 
 class RunOptions:
-    """The run that the options of `add_run_options` ask for.
+    """The run that a command line asks for.
 
     - `scene`, `variant`, `parameters`: see `linkax.scenes.scene.Scene`.
     - `t1`: end time [s]. `accuracy`, `solver`: see `linkax.simulate`.
@@ -69,7 +51,9 @@ class RunOptions:
         self.variant = self.scene.default_variant if arguments.variant is None else arguments.variant
         self.parameters = self.scene.settings(self.variant, _changes(arguments.changes))
         self.t1 = self.scene.duration(self.variant) if arguments.t1 is None else arguments.t1
-        self.accuracy = PRESETS[arguments.preset] if arguments.rtol is None else lx.Accuracy(rtol=arguments.rtol)
+        self.accuracy = (
+            getattr(lx, arguments.preset.upper()) if arguments.rtol is None else lx.Accuracy(rtol=arguments.rtol)
+        )
         self.mechanism = self.scene.mechanism(self.parameters)
         if arguments.solver is None:
             self.solver = default_solver(self.mechanism, None if arguments.dt else self.accuracy.rtol, self.t1)
@@ -91,37 +75,6 @@ class RunOptions:
         """Assemble the initial state."""
         progress("assembling", None)
         return self.scene.initial(mechanism, self.parameters)
-
-
-def positive(text: str) -> float:
-    """Read a positive, finite number.
-
-    **Raises:** `ArgumentTypeError` for other text.
-    """
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and number > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive, finite number")
-    return number
-
-
-def one_of(choices: Iterable[str]) -> Callable[[str], str]:
-    """A function that reads one of several words, in any case, and raises `ArgumentTypeError` for others."""
-
-    def read(text):
-        if text.lower() not in choices:
-            raise argparse.ArgumentTypeError(f"unknown {text!r}; known: {', '.join(choices)}")
-        return text.lower()
-
-    return read
-
-
-def _path(text) -> Path:
-    if not text:
-        raise argparse.ArgumentTypeError("'' is no folder; give its name")
-    return Path(text)
 
 
 def output_folder(asked: Path | None, prefix: str, settings: dict[str, Any], files: Iterable[str]) -> Path:
@@ -171,8 +124,8 @@ def write_json(path: Path, described: dict[str, Any]) -> None:
         unfinished.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
 
 
-def at_interrupt_in(folder: Path, keep: Callable[[], str] = lambda: "") -> None:
-    """At Ctrl-C, remove unfinished files from a folder, and call `keep`, see `linkax_command.at_interrupt`."""
+def at_interrupt_in(at_interrupt: AtInterrupt, folder: Path, keep: Callable[[], str] = lambda: "") -> None:
+    """At Ctrl-C, remove unfinished files from a folder, and call `keep`, see `linkax.cli.main.run`."""
 
     def leave():
         remove_unfinished(folder)

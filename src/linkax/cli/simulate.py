@@ -1,5 +1,6 @@
 """The command `linkax simulate SCENE`, which writes the trajectory and the pictures of one run."""
 
+import argparse
 import json
 import sys
 from collections.abc import Callable
@@ -9,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from linkax.cli.options import (
+    AtInterrupt,
     RunOptions,
-    add_run_options,
     at_interrupt_in,
     end_progress,
     output_folder,
@@ -20,7 +21,7 @@ from linkax.cli.options import (
 )
 from linkax.cli.progress_run import simulate_in_segments
 from linkax.cli.report import states, summary, trajectory
-from linkax.formulations.named import TANGENT_SPACE, formulation
+from linkax.formulations.named import formulation
 from linkax.simulation.explain.diagnosis import cause
 from linkax.simulation.read.solution import Solution
 from linkax.studies.files import written_whole
@@ -31,20 +32,12 @@ PART = ("trajectory-interrupted.npz", "summary-interrupted.json")
 WORTH_TELLING = 0.05  # distance from a singular configuration below which it is printed
 
 
-def add_command(commands: Any) -> None:
-    """Add the command to a parser's subparsers."""
-    parser = commands.add_parser("simulate", help="simulate a scene and write its trajectory and pictures")
-    parser.set_defaults(command=_simulate)
-    add_run_options(parser)
-    parser.add_argument("--formulation", default=TANGENT_SPACE, metavar="NAME", help="see `linkax compare --help`")
-
-
-def _simulate(arguments) -> int:
+def run_simulate(arguments: argparse.Namespace, at_interrupt: AtInterrupt) -> int:
     """Simulate, write the files, print a summary, and return the exit code."""
     asked, chosen = RunOptions(arguments), formulation(arguments.formulation)
     settings = asked.described | {"formulation": arguments.formulation}
     out = output_folder(arguments.out, asked.scene.name, settings, ("summary.json", PART[1]))
-    at_interrupt_in(out)
+    at_interrupt_in(at_interrupt, out)
     run = simulate_in_segments(
         asked.mechanism,
         asked.initial(asked.mechanism),
@@ -55,7 +48,7 @@ def _simulate(arguments) -> int:
         step=arguments.dt,
         intervals=INTERVALS,
         report=progress,
-        keep=lambda solution: at_interrupt_in(out, keeping(out, settings, solution)),
+        keep=lambda solution: at_interrupt_in(at_interrupt, out, keeping(out, settings, solution)),
     )
     progress("reading results", None)
     described = settings | summary(run, asked.points)
@@ -64,7 +57,7 @@ def _simulate(arguments) -> int:
         np.savez(path, **arrays)
     write_json(out / "summary.json", described)
     files = [out / "trajectory.npz", out / "summary.json"]
-    at_interrupt_in(out, lambda: f"the results are in {out}")
+    at_interrupt_in(at_interrupt, out, lambda: f"the results are in {out}")
     for name in PART:
         (out / name).unlink(missing_ok=True)
     if not arguments.no_plots:

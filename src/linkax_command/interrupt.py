@@ -1,4 +1,4 @@
-"""The command `linkax`, which hears Ctrl-C from its first moment, before linkax is imported.
+"""Hear Ctrl-C from the first moment on.
 
 Python delivers a signal to its main thread only once the current call returns, and XLA compiles and runs for minutes in
 one call. The KeyboardInterrupt that Python raises then may be swallowed by a callback, or leave XLA half way. Here
@@ -9,7 +9,8 @@ import _thread  # `threading` and `socket` take long to import
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 INTERRUPTED = 128 + signal.SIGINT  # the exit code
 
@@ -17,17 +18,13 @@ _ended: dict[str, str] = {}  # {"by": "interrupt" or "itself"}, whichever was fi
 _keeping: dict[str, Callable[[], str]] = {"last": lambda: ""}
 
 
-def main() -> int:
-    """Run the command line, see `linkax.cli.main`.
-
-    Ctrl-C ends it with one line and code 130; a second Ctrl-C ends it at once.
-    """
+@contextmanager
+def heard() -> Iterator[None]:
+    """Meanwhile Ctrl-C ends the process, with one line and code 130, and a second one ends it at once."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not one that a shell keeps from background jobs
         _listen()
     try:
-        from linkax.cli import main as run
-
-        return run()
+        yield
     finally:
         if not _ends_by("itself"):
             _rest()
