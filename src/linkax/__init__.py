@@ -74,6 +74,8 @@ from linkax.model.point_forces import Damper as Damper  # noqa: E402
 from linkax.model.point_forces import PointForce as PointForce  # noqa: E402
 from linkax.model.point_forces import PointMoment as PointMoment  # noqa: E402
 from linkax.model.point_forces import Spring as Spring  # noqa: E402
+from linkax.model.poses import Pose as Pose  # noqa: E402
+from linkax.model.poses import Velocity as Velocity  # noqa: E402
 from linkax.model.ropes import ElasticRope as ElasticRope  # noqa: E402
 from linkax.model.ropes import Rope as Rope  # noqa: E402
 from linkax.model.sections import Material as Material  # noqa: E402
@@ -92,7 +94,6 @@ from linkax.simulation.integrate.results import SimulationError as SimulationErr
 from linkax.simulation.integrate.results import StiffnessWarning as StiffnessWarning  # noqa: E402
 from linkax.simulation.integrate.rosenbrock import Rodas5P as Rodas5P  # noqa: E402
 from linkax.simulation.integrate.runge_kutta import RungeKutta4 as RungeKutta4  # noqa: E402
-from linkax.simulation.read.observables import Pose as Pose  # noqa: E402
 from linkax.simulation.read.observables import Power as Power  # noqa: E402
 from linkax.simulation.read.observables import Violation as Violation  # noqa: E402
 from linkax.simulation.read.solution import Solution as Solution  # noqa: E402

@@ -55,8 +55,8 @@ def test_poses_are_those_of_each_body():
     found = lx.Solution.of_state(mechanism, scene.initial(mechanism, settings))
     assert list(found.poses()) == [body.name for body in mechanism.bodies]
     for name, pose in found.poses().items():
-        np.testing.assert_allclose(pose.origin, found.position(name, at=[0.0, 0.0, 0.0]), atol=1e-15)
-        np.testing.assert_allclose(pose.axes, found.orientation(name), atol=1e-15)
+        np.testing.assert_allclose(pose.position, found.position(name, at=[0.0, 0.0, 0.0]), atol=1e-15)
+        np.testing.assert_allclose(pose.orientation, found.orientation(name), atol=1e-15)
 
 
 def test_optimise_is_deprecated():

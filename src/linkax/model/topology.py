@@ -1,7 +1,7 @@
 """The plan of a mechanism: its tree, its loops, and where coordinates and rows lie. Names and indices only."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple, cast
 
@@ -117,6 +117,12 @@ class Topology:
     def column(self, term: Term) -> int:
         """Find the index in v of the speed of a term; its joint must be in the tree."""
         return self.speeds[term.joint].start + (term.index or 0)
+
+    def columns_of(self, term: Term) -> np.ndarray:
+        """Find the indices in v of the speeds of a term; its joint must be in the tree."""
+        return (
+            np.arange(self.num_speeds)[self.speeds[term.joint]] if term.index is None else np.array([self.column(term)])
+        )
 
     def coordinate_slice(self, term: Term) -> slice:
         """Find where in q the coordinates of a term lie; its joint must be in the tree."""
@@ -259,6 +265,18 @@ class Topology:
         for body, carrier in enumerate(self.predecessor):
             root[body] = body if carrier == GROUND_INDEX else root[carrier]
         return root
+
+    def with_measures(self, measures: Sequence[AbstractJoint]) -> "Topology":
+        """The same plan with joints that close loops without rows, and only measure."""
+        index = {GROUND_NAME: GROUND_INDEX} | {name: place for place, name in enumerate(self.bodies)}
+        return dataclasses.replace(
+            self,
+            joints=(*self.joints, *(joint.name for joint in measures)),
+            parent=(*self.parent, *(index[joint.parent.body] for joint in measures)),
+            child=(*self.child, *(index[joint.child.body] for joint in measures)),
+            joint_types=(*self.joint_types, *(joint.kind for joint in measures)),
+            driven_by=(*self.driven_by, *(joint.driven_by for joint in measures)),
+        )
 
     def describe(self) -> str:
         """Describe the spanning tree, the cut joints and the constraints on coordinates, a line for each."""

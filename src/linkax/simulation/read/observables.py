@@ -18,6 +18,7 @@ from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.least_multipliers import LeastMultipliers, least_multipliers
 from linkax.model.beams import Beam
+from linkax.model.poses import Pose
 from linkax.spatial.rotations import rotate
 from linkax.spatial.vectors import cross, largest
 from linkax.xla.arrays import Array, Scalar
@@ -35,13 +36,6 @@ class Violation(NamedTuple):
     position: Float[Array, "..."]
     velocity: Float[Array, "..."]
     acceleration: Float[Array, "..."]
-
-
-class Pose(NamedTuple):
-    """Pose of a body's reference frame: origin [m], (..., 3), and axes as columns, (..., 3, 3)."""
-
-    origin: Float[Array, "... 3"]
-    axes: Float[Array, "... 3 3"]
 
 
 class Power(NamedTuple):

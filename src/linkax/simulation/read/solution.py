@@ -15,6 +15,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, number, require
+from linkax.model.poses import Pose
 from linkax.simulation.explain.error_estimate import refined_run
 from linkax.simulation.explain.remarks import remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
@@ -31,7 +32,7 @@ from linkax.simulation.read.by_name import (
     of_point,
     reaction_of,
 )
-from linkax.simulation.read.observables import Observables, Pose, Power, Violation
+from linkax.simulation.read.observables import Observables, Power, Violation
 from linkax.simulation.read.passages import Passages, passages
 from linkax.simulation.read.reading import evaluate_dense, read, read_in_motion
 from linkax.simulation.start.state import State

@@ -21,9 +21,12 @@ from linkax.simulation.start.closing import CLOSED, LoopClosure, close_loops
 from linkax.simulation.start.initial_state import ON_BRANCH, moving_joints
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import beams_of, rank_tolerance
+from linkax.simulation.start.places import Places, called
+from linkax.simulation.start.rough_start import rough_start
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import (
-    JointNumbers,
+    WorldMotion,
+    WorldPlaces,
     check_mechanism,
     checked_time,
     coordinates_by_joint,
@@ -46,10 +49,10 @@ class AssemblyWarning(UserWarning):
 
 def assemble(
     mechanism: Mechanism,
-    positions: JointNumbers | None = None,
-    speeds: JointNumbers | None = None,
+    positions: WorldPlaces | None = None,
+    speeds: WorldMotion | None = None,
     *,
-    guess: JointNumbers | None = None,
+    guess: WorldPlaces | None = None,
     t: Number = 0.0,
 ) -> State:
     """Find a state on the closed loops, from coordinates and speeds of some of the joints.
@@ -58,13 +61,18 @@ def assemble(
 
     - `positions`: {joint: coordinates [rad or m]}, of joints in the tree or cut; held. A number for
       a joint with one coordinate, else all of them; see the joint types. For one of several the
-      key is (joint, index), counted like the joint's speeds.
-    - `speeds`: {joint: speeds [rad/s or m/s]}, likewise; held.
-    - `guess`: {joint: coordinates} of joints in the tree, where the search starts (default:
-      frames that coincide); chooses the assembly mode.
+      key is (joint, index), counted like the joint's speeds. Also places in the world: {body: `linkax.Pose`}, or
+      {"body.frame": [x, y, z]} for a point that the body names, and {body: [x, y, z]} for its reference frame [m].
+    - `speeds`: {joint: speeds [rad/s or m/s]}, likewise; held. In the world: {body: `linkax.Velocity`}, or
+      {"body.frame": [x, y, z]} [m/s].
+    - `guess`: {joint: coordinates} and places in the world, as for `positions`, where these are roughly; chooses the
+      assembly mode. By default the search starts where frames of joints in the tree coincide.
     - `t`: time [s], for drives.
 
-    Coordinates that are not held change as little as the loops allow from the guess, and speeds that are not held are
+    For example, `assemble(mechanism, {"crank": 0.3}, guess={"rocker.tip": [1.0, 0.5, 0.0]})`.
+
+    Coordinates that are not held change as little as the loops allow from the guess (from the tree's coordinates that
+    fit best, where it names cut joints or places), and speeds that are not held are
     the smallest that the loops allow, both in radians and lengths of the mechanism. Where the search does not reach
     closed loops from the guess, it starts again beside it, a little and then farther. Strains of beams stay as guessed,
     by default zero; where no start closes the loops so, they change, with little energy. In a singular configuration,
@@ -73,7 +81,7 @@ def assemble(
 
     Differentiable in the numbers of the mechanism, positions, speeds and the guess, to any order. A coordinate that is
     neither held nor decided by the loops has the derivative of the nearest to the guess, as if the guess closed the
-    loops.
+    loops. A guess of cut joints or places has no derivative.
 
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
@@ -84,12 +92,13 @@ def assemble(
     """
     check_mechanism(mechanism)
     t = checked_time(t, "t")
-    held, begin = (coordinates_by_joint(mechanism, *given) for given in ((positions, "position"), (guess, "guess")))
-    moving = speeds_by_joint(mechanism, speeds, "speed")
-    for (name, _), _ in begin.by_term():
-        if name not in mechanism.topology.coordinates:
-            raise ValueError(f"guess for joint {name!r}, which is cut; guess coordinates of joints in the tree")
-    state, remainder = _assembled(flat_with_known(mechanism), held, moving, begin, t)
+    places = Places(mechanism)
+    positions, guess = places.positions(positions, "position"), places.positions(guess, "guess")
+    speeds = places.speeds(speeds, "speed")
+    measured = places.measured()
+    held, begin = (coordinates_by_joint(measured, *given) for given in ((positions, "position"), (guess, "guess")))
+    moving = speeds_by_joint(measured, speeds, "speed")
+    state, remainder = _assembled(flat_with_known(measured), held, moving, begin, t)
     if not all_concrete((state, remainder)):
         return _marked(mechanism, state, remainder)
     remainder = jax.tree.map(np.asarray, remainder)
@@ -103,7 +112,7 @@ def assemble(
                 AssemblyWarning,
                 stacklevel=2,
             )
-    if remainder.undecided and (names := _open_speeds(mechanism, moving, t, state)):
+    if remainder.undecided and (names := _open_speeds(mechanism, measured, moving, t, state)):
         warnings.warn(
             f"the configuration is singular, and the speeds asked fit several branches of the motion, which differ in "
             f"the speeds of joints {names}; to choose a branch, ask for the speeds of some of these, too",
@@ -113,9 +122,9 @@ def assemble(
     return state
 
 
-def _open_speeds(mechanism, speeds, t, state):
+def _open_speeds(mechanism, measured, speeds, t, state):
     """Names of joints whose speeds differ on other branches that have the speeds asked."""
-    others, are_some = other_speeds(mechanism, speeds, t, state.q, state.v)
+    others, are_some = other_speeds(measured, speeds, t, state.q, state.v)
     differences = (others - state.v)[np.asarray(are_some)].T
     names = moving_joints(system_of(mechanism, state.q.dtype), t, state.q, differences) if differences.size else ()
     return ", ".join(map(repr, names))
@@ -123,7 +132,7 @@ def _open_speeds(mechanism, speeds, t, state):
 
 def _raise_if_open(mechanism, state, t, remainder):
     topology = mechanism.topology
-    held = ", ".join(repr(along.joint) for along, _ in remainder.positions.by_term()) or "none"
+    held = ", ".join(dict.fromkeys(repr(along.joint) for along, _ in remainder.positions.by_term())) or "none"
     remains = lambda size, unit: f"a gap of {size:.6g} {unit} remains (positions held: {held})"
     advice = "check lengths and offsets, hold fewer positions, or give another guess"
     gap, scaled = remainder.gap, remainder.gap_in_scales
@@ -143,7 +152,7 @@ def _raise_if_open(mechanism, state, t, remainder):
             if not np.all(np.abs(miss) <= remainder.most):
                 size = np.max(np.abs(miss))
                 raise AssemblyError(
-                    f"the {what} asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not "
+                    f"the {what} asked of {called(along.joint)} is missed by {size:.6g}; the loops do not "
                     f"allow it together with the other {what}s given, so ask for fewer"
                 )
     tolerance = np.asarray(rank_tolerance(state.q.dtype))  # with which nothing is compiled
@@ -198,6 +207,8 @@ def _assembled(*given):
 @Program
 def _assemble(flat, positions, speeds, guess, t, *, branches):
     demand, begin = _demand(flat, positions, guess, t)
+    if (rough := guess.of_cuts()).groups:
+        begin = rough_start(*lax.stop_gradient((demand, rough, begin)), _given(demand, guess))
     q = close_loops(demand, begin, None)
     system, configuration = demand.system, configure(demand.system, t, q)
     found = (speeds_on_branch if branches else smallest_speeds)(configuration, speeds)
@@ -242,3 +253,12 @@ def _demand(flat, positions, guess, t):
             if alike.in_tree:
                 q = scatter_static(q, alike.in_q(topology), rows)
     return LoopClosure(system, t, positions), on_manifold(topology, q)
+
+
+def _given(demand, guess):
+    """Which coordinates of joints in the tree are given, (n_v,), one for each speed."""
+    topology = demand.system.topology
+    groups = [alike for alike in (*guess.groups, *demand.held.groups) if alike.in_tree]
+    terms = [along for alike in groups for along in alike.terms]
+    columns = [topology.columns_of(along) for along in terms]
+    return np.isin(np.arange(topology.num_speeds), np.concatenate([np.zeros(0, int), *columns]))

@@ -54,6 +54,11 @@ class LoopClosure(eqx.Module):
         return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], held])
 
     @straight_line
+    def rows_at(self, q: Float[Array, " n_q"]) -> Float[Array, " n"]:
+        """All residuals at coordinates."""
+        return self.rows(configure(self.system, self.t, q))
+
+    @straight_line
     def size(self, q: Float[Array, " n_q"]) -> Float[Array, ""]:
         """The size of all residuals."""
         return _size(self.rows(configure(self.system, self.t, q)))

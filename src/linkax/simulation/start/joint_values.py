@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import Configuration, wrapped
 from linkax.equations.motion import Motion
@@ -91,6 +91,19 @@ class JointValues(eqx.Module):
         """Terms with their numbers."""
         of_groups = zip(self.groups, self.values, strict=True)
         return [pair for alike, rows in of_groups for pair in zip(alike.terms, rows, strict=True)]
+
+    def of_cuts(self) -> "JointValues":
+        """Those of cut joints."""
+        kept = [index for index, alike in enumerate(self.groups) if not alike.in_tree]
+        return JointValues(tuple(self.groups[index] for index in kept), tuple(self.values[index] for index in kept))
+
+    def slides(self) -> Bool[np.ndarray, " _"]:
+        """Which changes, of those that `apart` gives, are lengths, in the order of `flat`."""
+        lengths = []
+        for alike in self.groups:
+            units = alike.kind.speed_units if alike.index is None else (alike.kind.speed_units[alike.index],)
+            lengths += [unit == "m" for _ in alike.terms for unit in units]
+        return np.array(lengths, dtype=bool)
 
     def flat(self) -> Float[Array, " _"]:
         """All numbers."""

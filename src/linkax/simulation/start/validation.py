@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from linkax.model.functions import Law
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, Vector, is_finite, namespace, number, real, require, require_type
+from linkax.model.poses import Pose, Velocity
 from linkax.model.terms import TermLike, term
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.state import State
@@ -26,6 +27,9 @@ from linkax.xla.tracing import concrete
 JointNumbers = (
     Mapping[str, Number | Vector] | Mapping[tuple[str, int], Number | Vector] | Mapping[TermLike, Number | Vector]
 )
+# The same, or places of bodies or their motion in the world, by the names of bodies, or "body.frame".
+WorldPlaces = Mapping[str, Number | Vector | Pose] | JointNumbers | Mapping[TermLike, Number | Vector | Pose]
+WorldMotion = Mapping[str, Number | Vector | Velocity] | JointNumbers | Mapping[TermLike, Number | Vector | Velocity]
 Tree = TypeVar("Tree")
 
 

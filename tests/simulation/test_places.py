@@ -1,0 +1,88 @@
+"""Assembly from where bodies and points are in the world."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from refusals import refused
+
+import linkax as lx
+
+
+def four_bar(coupler=1.0, origin=0.0):
+    crank, link, rocker = lx.rod("crank", 0.4, 1.0), lx.rod("coupler", coupler, 1.0), lx.rod("rocker", 0.8, 1.0)
+    hinge = lambda *ends: lx.Revolute(*ends, axis="z")
+    joints = [
+        hinge("A", lx.GROUND.at([origin, 0.0, 0.0]), crank.at("base")),
+        hinge("B", crank.at("tip"), link.at("base")),
+        hinge("C", link.at("tip"), rocker.at("tip")),
+        hinge("D", lx.GROUND.at([origin + 1.0, 0.0, 0.0]), rocker.at("base")),
+    ]
+    return lx.Mechanism([crank, link, rocker], joints)
+
+
+def read(mechanism, state):
+    return lx.Solution.of_state(mechanism, state)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("origin", [0.0, 1e6])
+def test_a_rough_place_of_a_point_chooses_the_mode(side, origin):
+    mechanism = four_bar(origin=origin)
+    state = lx.assemble(mechanism, {"A": 1.0}, guess={"coupler.tip": [origin + 1.0, 0.7 * side, 0.0]})
+    place = read(mechanism, state).position("coupler", at="tip")[0]
+    np.testing.assert_allclose(np.linalg.norm(place - np.array([origin + 1.0, 0.0, 0.0])), 0.8, atol=1e-9)
+    assert np.sign(place[1]) == side
+
+
+def test_a_cut_joint_is_guessed_as_one_in_the_tree_is():
+    mechanism = four_bar()
+    known = lx.assemble(mechanism, {"A": 1.0}, guess={"coupler.tip": [1.0, -0.7, 0.0]})
+    (name,) = set(mechanism.topology.joints) - set(mechanism.topology.coordinates)
+    angle = float(read(mechanism, known).joint(name)[0])
+    state = lx.assemble(mechanism, {"A": 1.0}, guess={name: angle + 0.2})
+    np.testing.assert_allclose(state.q, known.q, atol=1e-9)
+
+
+def test_places_and_velocities_in_the_world_are_held():
+    mechanism = four_bar()
+    known = lx.assemble(mechanism, {"A": 1.0}, {"A": 2.0}, guess={"coupler.tip": [1.0, 0.7, 0.0]})
+    at = read(mechanism, known)
+    rough = lx.Pose(at.position("rocker", at="base")[0] + 0.1, at.orientation("rocker")[0])
+    pose = lx.Pose(at.position("coupler", at="base")[0], at.orientation("coupler")[0])
+    linear = {"crank.tip": at.velocity("crank", at="tip")[0]}
+    state = lx.assemble(mechanism, {"coupler": pose}, linear, guess={"rocker": rough})
+    np.testing.assert_allclose(state.q, known.q, atol=1e-9)
+    np.testing.assert_allclose(state.v, known.v, atol=1e-9)
+
+
+def test_derivatives_of_what_is_held_in_the_world():
+    """Of the rocker's angle by the place of the crank's tip along its circle, and by the coupler's length."""
+
+    def angle(turn, coupler):
+        mechanism = four_bar(coupler)
+        tip = 0.4 * jnp.stack([jnp.cos(turn), jnp.sin(turn), jnp.zeros(())])
+        state = lx.assemble(mechanism, {"crank.tip": tip}, guess={"coupler.tip": [1.0, 0.7, 0.0]})
+        return state.q[mechanism.topology.coordinates["D"]][0]
+
+    def exact(turn, coupler):
+        reach = jnp.stack([0.4 * jnp.cos(turn) - 1.0, 0.4 * jnp.sin(turn)])
+        distance = jnp.linalg.norm(reach)
+        between = jnp.arccos((0.64 + distance**2 - coupler**2) / (1.6 * distance))
+        return jnp.arctan2(reach[1], reach[0]) - between
+
+    numbers = (1.0, 1.0)
+    np.testing.assert_allclose(angle(*numbers), exact(*numbers), atol=1e-9)
+    slopes = jax.grad(angle, (0, 1))(*numbers)
+    np.testing.assert_allclose(slopes, jax.grad(exact, (0, 1))(*numbers), rtol=1e-8)
+
+
+def test_what_is_wrong_is_named():
+    mechanism = four_bar()
+    refused(lambda: lx.assemble(mechanism, guess={"rocker.top": [0.0, 0.0, 0.0]}), "'rocker'", "'top'", "'tip'")
+    refused(lambda: lx.assemble(mechanism, guess={"lever": lx.Pose([0.0, 0.0, 0.0])}), "'lever'", "'rocker'")
+    refused(lambda: lx.assemble(mechanism, {"rocker.tip": [0.0, 1.0]}), "'rocker.tip'", "(2,)")
+    refused(lambda: lx.assemble(mechanism, {"rocker": lx.Velocity([0.0, 1.0, 0.0])}), "'rocker'", "Pose")
+    refused(lambda: lx.assemble(mechanism, guess={"rocker": lx.Pose([0.0, 1.0, 0.0], 2.0 * np.eye(3))}), "'rocker'")
+    with pytest.raises(lx.AssemblyError, match=r"position asked of 'rocker.tip' in the world is missed by|not close"):
+        lx.assemble(mechanism, {"rocker.tip": [5.0, 0.0, 0.0]})
