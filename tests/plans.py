@@ -142,7 +142,8 @@ BAD = {
     "axis": [*VECTOR, "w", "", [0.0, 0.0, 0.0], jnp.zeros(3), [1e200, 1e200, 0.0], jnp.asarray([0.0, 1e-200, 0.0])],
     "rotation": [*MATRIX, 2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), jnp.ones((3, 3)), np.zeros((3, 3))],
     "inertia": [
-        *MATRIX, None, [1.0, 2.0], -np.eye(3), np.diag([1.0, 1.0, -0.5]), np.diag([1.0, 1.0, 3.0]),
+        *(entry for entry in MATRIX if not isinstance(entry, float)), None, -0.5, [1.0, 2.0], -np.eye(3),
+        np.diag([1.0, 1.0, -0.5]), np.diag([1.0, 1.0, 3.0]),
         np.eye(3) + np.triu(np.ones((3, 3)), 1), [1.0, np.nan, 1.0], jnp.asarray([1.0, 1.0, 2.5]), [True, True, True],
         np.diag([1e308, 1e308, -1e308]),
     ],
@@ -216,9 +217,10 @@ def _place(draw, name):
 
 
 KINDS = (
-    lx.Revolute, lx.Universal, lx.Spherical, lx.Prismatic, lx.Cylindrical, lx.Fixed, lx.Planar, lx.Free, lx.Screw,
+    lx.Revolute, lx.Universal, lx.Spherical, lx.Prismatic, lx.Cylindrical, lx.Fixed, lx.Planar, lx.Rectangular,
+    lx.Free, lx.Screw,
 )  # fmt: skip
-WITH_AXIS = (lx.Revolute, lx.Universal, lx.Prismatic, lx.Cylindrical, lx.Planar, lx.Screw)
+WITH_AXIS = (lx.Revolute, lx.Universal, lx.Prismatic, lx.Cylindrical, lx.Planar, lx.Rectangular, lx.Screw)
 
 
 def _joint(draw, kind, name, parent, child):

@@ -47,7 +47,6 @@ from linkax.model.bodies import Frame as Frame  # noqa: E402
 from linkax.model.bodies import RigidBody as RigidBody  # noqa: E402
 from linkax.model.bodies import box as box  # noqa: E402
 from linkax.model.bodies import point_mass as point_mass  # noqa: E402
-from linkax.model.bodies import rod as rod  # noqa: E402
 from linkax.model.constraints import Coupling as Coupling  # noqa: E402
 from linkax.model.constraints import Drive as Drive  # noqa: E402
 from linkax.model.forces import AbstractForce as AbstractForce  # noqa: E402
@@ -65,6 +64,7 @@ from linkax.model.joints.free import Free as Free  # noqa: E402
 from linkax.model.joints.joint import AbstractJoint as AbstractJoint  # noqa: E402
 from linkax.model.joints.planar import Planar as Planar  # noqa: E402
 from linkax.model.joints.prismatic import Prismatic as Prismatic  # noqa: E402
+from linkax.model.joints.rectangular import Rectangular as Rectangular  # noqa: E402
 from linkax.model.joints.revolute import Revolute as Revolute  # noqa: E402
 from linkax.model.joints.screw import Screw as Screw  # noqa: E402
 from linkax.model.joints.spherical import Spherical as Spherical  # noqa: E402
@@ -76,6 +76,8 @@ from linkax.model.point_forces import PointMoment as PointMoment  # noqa: E402
 from linkax.model.point_forces import Spring as Spring  # noqa: E402
 from linkax.model.poses import Pose as Pose  # noqa: E402
 from linkax.model.poses import Velocity as Velocity  # noqa: E402
+from linkax.model.rods import rod as rod  # noqa: E402
+from linkax.model.rods import rod_between as rod_between  # noqa: E402
 from linkax.model.ropes import ElasticRope as ElasticRope  # noqa: E402
 from linkax.model.ropes import Rope as Rope  # noqa: E402
 from linkax.model.sections import Material as Material  # noqa: E402

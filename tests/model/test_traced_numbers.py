@@ -48,13 +48,17 @@ CASES = {
     "ground: offset": (lx.GROUND.at, *VECTOR),
     "ground: rotation": (lambda x: lx.GROUND.at([0.0, 0.0, 0.0], x), *ROTATION),
     "rod: length": (lambda x: lx.rod("rod", x, 1.0), 1.0, POSITIVE),
+    "rod: thickness": (lambda x: lx.rod("rod", 1.0, 1.0, x), 0.1, NOT_NEGATIVE),
+    "rod: tip": (lambda x: lx.rod_between("rod", [0.0, 0.0, 0.0], x, 1.0), *VECTOR),
+    "body: place": (lambda x: LINK.placed(x), *VECTOR),
+    "body: orientation": (lambda x: LINK.placed([0.0, 0.0, 0.0], x), *ROTATION),
     "rod: mass": (lambda x: lx.rod("rod", 1.0, x), 1.0, NOT_NEGATIVE),
     "box: size": (lambda x: lx.box("box", x, 1.0), np.ones(3), [[1.0, 0.0, 1.0], [1.0, 1.0, -1.0], [1.0, np.inf, 1.0]]),
     "box: mass": (lambda x: lx.box("box", [1.0, 2.0, 3.0], x), 1.0, NOT_NEGATIVE),
     "point mass": (lambda x: lx.point_mass("point", x), 1.0, NOT_NEGATIVE),
     **{
         f"{kind.__name__}: axis": (lambda x, kind=kind: kind("joint", **ENDS, axis=x), *AXIS)
-        for kind in (lx.Revolute, lx.Prismatic, lx.Cylindrical, lx.Planar, lx.Universal)
+        for kind in (lx.Revolute, lx.Prismatic, lx.Cylindrical, lx.Planar, lx.Rectangular, lx.Universal)
     },
     **{
         f"{kind.__name__}: offset": (lambda x, kind=kind: kind("joint", lx.GROUND.at(x), LINK), *VECTOR)

@@ -1,8 +1,9 @@
 """Rigid bodies and the frames on them."""
 
 import abc
+import copy
 from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import equinox as eqx
 import numpy as np
@@ -18,10 +19,10 @@ from linkax.model.numbers import (
     number,
     numbers_of,
     one_of,
-    positive,
     require,
     require_type,
     rotation_matrix,
+    value,
     zero_or_more,
 )
 from linkax.straight_line.known import known_values
@@ -94,7 +95,9 @@ class RigidBody(AbstractBody):
     - `name`: unique in the mechanism.
     - `mass`: [kg], zero or more.
     - `center_of_mass`: [m], shape (3,).
-    - `inertia`: inertia tensor about the centre of mass [kg m²], shape (3, 3), or its diagonal, shape (3,).
+    - `inertia`: inertia tensor about the centre of mass [kg m²], shape (3, 3), or its diagonal, shape (3,). A single
+      number is the moment about z of a flat body, which is all that counts where it moves in the x-y plane; the other
+      two are then half of it.
     - `frames`: named points `{"tip": [x, y, z]}` [m], for `body.at("tip")`.
     - `shape`: how it is drawn: "box" or "ellipsoid", of this mass and inertia; None: by its joints and frames.
 
@@ -108,13 +111,14 @@ class RigidBody(AbstractBody):
     inertia: Float[Array, "3 3"]
     frames: dict[str, Float[Array, "3"]]
     shape: Shape | None = eqx.field(static=True)
+    drawn_at: Float[Array, "3"] | None
 
     def __init__(
         self,
         name: str,
         mass: Number,
         center_of_mass: Vector = (0.0, 0.0, 0.0),
-        inertia: Matrix = (0.0, 0.0, 0.0),
+        inertia: Number | Matrix = (0.0, 0.0, 0.0),
         frames: Mapping[str, Vector] | None = None,
         *,
         shape: Shape | None = None,
@@ -122,7 +126,8 @@ class RigidBody(AbstractBody):
         self.name = body_name(name)
         self.mass = zero_or_more(mass, f"body {name!r}: mass [kg]")
         self.center_of_mass = number(center_of_mass, (3,), f"body {name!r}: center_of_mass [m]")
-        self.inertia = inertia_tensor(inertia, f"body {name!r}: inertia [kg m²]")
+        what, moments = f"body {name!r}: inertia [kg m²]", cast(Matrix, inertia)
+        self.inertia = inertia_tensor(_of_flat(inertia, what) if _depth(inertia) == 0 else moments, what)
         frames = {} if frames is None else frames
         require_type(frames, Mapping, f"body {name!r}: frames", 'give {"tip": [x, y, z]}')
         self.frames = {
@@ -130,6 +135,7 @@ class RigidBody(AbstractBody):
             for label, offset in frames.items()
         }
         self.shape = None if shape is None else one_of(shape, get_args(Shape), f"body {name!r}: shape")
+        self.drawn_at = None
 
     def _label(self, label: Any) -> str:
         if not isinstance(label, str) or not label:
@@ -161,6 +167,45 @@ class RigidBody(AbstractBody):
             offset = number(where, (3,), f"offset of a frame on body {self.name!r} [m]")
         return Frame(self.name, offset, rotation_matrix(rotation, f"rotation of a frame on body {self.name!r}"))
 
+    def placed(self, position: Vector, orientation: Matrix | None = None) -> "RigidBody":
+        """The same body as it stands in the world in one configuration, in which a model is drawn, as CAD knows it.
+
+        Its reference frame is then parallel to the world's in that configuration. Where all bodies of a joint are
+        placed, `at_world` gives its frames, its axis is one in the world, and its coordinates are zero as drawn:
+
+        ```python
+        arm = lx.rod("arm", length=1.0, mass=1.0).placed([0.0, 0.0, 2.0])
+        fork = lx.box("fork", [0.1, 0.2, 0.3], mass=2.0).placed([1.0, 0.5, 2.0])
+        pin = lx.Revolute("pin", arm.at_world([1.0, 0.0, 2.0]), fork.at_world([1.0, 0.0, 2.0]), axis="y")
+        ```
+
+        **Arguments:** `position`: of the origin of its reference frame [m]; `orientation`: the axes of this frame as
+        columns, in ground axes, shape (3, 3) (default: parallel).
+        """
+        what = f"body {self.name!r}: %s in the world"
+        found = copy.copy(self)
+        placed: dict[str, Any] = {"drawn_at": number(position, (3,), what % "position" + " [m]")}
+        if orientation is not None:
+            turn = value(rotation_matrix(orientation, what % "orientation"))
+            placed["center_of_mass"] = turn @ self.center_of_mass
+            placed["inertia"] = turn @ self.inertia @ turn.T
+            placed["frames"] = {label: turn @ offset for label, offset in self.frames.items()}
+        for name, entry in placed.items():
+            object.__setattr__(found, name, entry)
+        return found
+
+    def at_world(self, point: Vector, rotation: Matrix | None = None) -> Frame:
+        """Make a frame on this body from where it is in the world as the body is `placed`.
+
+        **Arguments:** `point`: its origin [m], shape (3,); `rotation`: its axes as columns, in ground axes.
+
+        **Raises:** `ValueError` for a body that is not placed.
+        """
+        what = f"body {self.name!r}: a point in the world [m]"
+        if self.drawn_at is None:
+            raise ValueError(f"{what} is {point!r}, but its place is not known; give it by body.placed(position)")
+        return self.at(number(point, (3,), what) - self.drawn_at, rotation)
+
 
 def body_name(name: Any) -> str:
     """Check the name of a body."""
@@ -185,6 +230,12 @@ def _depth(entry: Any) -> int:
     if isinstance(entry, list | tuple):
         return 1 + (_depth(entry[0]) if entry else 0)
     return np.ndim(entry)
+
+
+def _of_flat(moment: Any, what: str) -> list[Scalar]:
+    """Principal moments of a flat body from that about z."""
+    moment = number(moment, (), what)
+    return [moment / 2.0, moment / 2.0, moment]
 
 
 def inertia_tensor(inertia: Matrix, what: str) -> Float[Array, "3 3"]:
@@ -214,27 +265,6 @@ def _principal_moments(tensor: Array, diagonal: bool) -> Float[Array, "3"]:
     tensor = numbers_of(tensor)
     xp = namespace(tensor)
     return xp.sort(xp.diagonal(tensor)) if diagonal else xp.linalg.eigvalsh(tensor / 2.0 + tensor.T / 2.0)
-
-
-def rod(name: str, length: Number, mass: Number) -> RigidBody:
-    """Make a uniform slender rod along its x axis, from frame "base", its reference frame, to frame "tip".
-
-    Its moment of inertia is mass × length² / 12 about transverse axes, and zero about its own.
-
-    **Arguments:** `name`: unique in the mechanism; `length` [m]; `mass` [kg].
-
-    **Raises:** `ValueError` for a length that is not positive, and for a negative mass.
-    """
-    length = positive(length, f"rod {name!r}: length [m]")
-    mass = number(mass, (), f"body {name!r}: mass [kg]")
-    across = mass * length**2 / 12
-    return RigidBody(
-        name,
-        mass,
-        center_of_mass=[length / 2, 0.0, 0.0],
-        inertia=[0.0, across, across],
-        frames={"base": [0.0, 0.0, 0.0], "tip": [length, 0.0, 0.0]},
-    )
 
 
 def point_mass(name: str, mass: Number) -> RigidBody:

@@ -15,6 +15,20 @@ class Free(AbstractJoint):
     [m] of its origin in the parent's frame. Speeds: angular velocity relative to the parent
     [rad/s], and velocity of the child's origin seen from the parent [m/s], both in axes of the
     parent's frame. Where the joint is cut, w ≥ 0.
+
+    Between bodies that other joints hold, it only measures: `cut=True` keeps it out of the tree. Its coordinates can
+    then be held, guessed and read like those of any joint:
+
+    ```python
+    arm, wrist = lx.rod("arm", length=1.0, mass=1.0), lx.rod("wrist", length=0.3, mass=0.2)
+    joints = [
+        lx.Revolute("shoulder", lx.GROUND, arm.at("base"), axis="z"),
+        lx.Revolute("elbow", arm.at("tip"), wrist.at("base"), axis="z"),
+        lx.Free("hand", lx.GROUND, wrist.at("tip"), cut=True),
+    ]
+    robot = lx.Mechanism([arm, wrist], joints)
+    state = lx.assemble(robot, {("hand", 3): 0.8, ("hand", 4): 0.7})  # x and y; speeds count from 0
+    ```
     """
 
     speed_units = ("rad", "rad", "rad", "m", "m", "m")

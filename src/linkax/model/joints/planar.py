@@ -13,6 +13,10 @@ class Planar(AbstractJoint):
     Coordinates: angle [rad] from the parent's h² to the child's, right-handed about h¹, and the
     distances [m] of the child's frame from the parent's along the parent's h² and h³. Where the
     joint is cut the angle is in (−π, π].
+
+    Between bodies of a planar mechanism that other joints hold, it only measures where `cut=True` keeps it out of the
+    tree: `lx.Planar("pose", lx.GROUND, platform, axis="z", cut=True)` has the platform's angle, x and y as
+    coordinates, to hold in `lx.assemble`, to guess, or to read by `solution.joint("pose")`.
     """
 
     speed_units = ("rad", "m", "m")
