@@ -18,7 +18,7 @@ from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, over_subtree, product_along_path, sum_by_speed
 from linkax.linalg.static_sparse import constant_product
 from linkax.model.beams import Beam
-from linkax.model.bodies import GROUND_NAME, Frame
+from linkax.model.bodies import Frame
 from linkax.model.forces import Load
 from linkax.model.joints.bending import section_at
 from linkax.model.numbers import Number, value
@@ -83,7 +83,7 @@ class Configuration(eqx.Module):
 
     def body(self, name: str) -> int:
         """Index of a body, or of ground."""
-        return GROUND_INDEX if name == GROUND_NAME else self.system.topology.bodies.index(name)
+        return self.system.topology.body_index(name)
 
     def arm(self, frame: Frame) -> Float[Array, "3"]:
         """Vector from the reference point of a frame's body to the frame's origin, in ground axes [m]."""
@@ -149,7 +149,7 @@ class Configuration(eqx.Module):
     def _cut(self, names):
         """Type, axes on the parents, and indices of cut joints of one type."""
         topology = self.system.topology
-        joints = np.array([topology.joints.index(name) for name in names])
+        joints = np.array([topology.joint_index(name) for name in names])
         cut = joints - topology.num_bodies
         return topology.cut_types[cut[0]], self.joint_axes[joints], cut
 

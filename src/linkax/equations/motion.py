@@ -13,7 +13,7 @@ from linkax.equations.configuration import Configuration
 from linkax.equations.joint_motions import over_bending
 from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, expand_to_motions, sum_by_body
-from linkax.model.bodies import Frame
+from linkax.model.bodies import BodyOrFrame, Frame, frame_of
 from linkax.model.forces import Load
 from linkax.model.numbers import Number
 from linkax.model.terms import Term
@@ -28,6 +28,10 @@ from linkax.xla.tracing import jit_inline
 
 class Motion(eqx.Module):
     """The motion of all bodies at (t, q, v): what a force element reads, and how it makes its load.
+
+    `joint` and `joint_speed` read it by a joint's name, `point_position`, `point_velocity` and `orientation` at a body
+    or `body.at(...)`, in ground axes; `point_load` and `joint_load` make loads. Its arrays are in the order of the
+    bodies, ground last:
 
     - `angular_velocity` [rad/s], (n_b + 1, 3); `velocity` of reference points [m/s], (n_b + 1, 3).
     - `angular_bias` [rad/s²], `bias` [m/s²]: velocity-product accelerations, the part without v̇, (n_b + 1, 3).
@@ -66,7 +70,7 @@ class Motion(eqx.Module):
     def cut_speeds(self, names: Sequence[str]) -> Float[Array, "k n"]:
         """Speeds of cut joints of one type [rad/s or m/s]."""
         topology, configuration, omega = self.system.topology, self.configuration, self.angular_velocity
-        joints = np.array([topology.joints.index(name) for name in names])
+        joints = np.array([topology.joint_index(name) for name in names])
         parent, child = np.array(topology.parent)[joints], np.array(topology.child)[joints]
         on_child = self.velocity[child] + cross(omega[child], configuration.child_arm[joints])
         arm = configuration.parent_arm[joints] + configuration.separation[joints - topology.num_bodies]
@@ -83,15 +87,29 @@ class Motion(eqx.Module):
         topology, configuration, none = self.system.topology, self.configuration, Load.none(self.system)
         if term.joint in topology.speeds:
             return none._replace(joint_force=none.joint_force.at[topology.column(term)].set(force))
-        joint = topology.joints.index(term.joint)
+        joint = topology.joint_index(term.joint)
         parent, child, cut = topology.parent[joint], topology.child[joint], joint - topology.num_bodies
         angular, linear = (columns[0, term.index or 0] * force for columns in configuration.cut_subspace([term.joint]))
         on_parent = configuration.parent_arm[joint] + configuration.separation[cut]
         load = configuration.wrench(child, configuration.child_arm[joint], linear, angular)
         return load.plus(configuration.wrench(parent, on_parent, -linear, -angular))
 
-    def point_velocity(self, frame: Frame) -> Float[Array, "3"]:
-        """Velocity of the origin of a frame [m/s]."""
+    def point_position(self, point: BodyOrFrame) -> Float[Array, "3"]:
+        """Position of a point in ground axes [m]: the origin of `body.at(...)`, or of a body's reference frame."""
+        return self.configuration.point(frame_of(point, "point"))
+
+    def orientation(self, body: BodyOrFrame | str) -> Float[Array, "3 3"]:
+        """Axes of a body's reference frame, or of a frame `body.at(...)`, as columns in ground axes.
+
+        `body`: also the name of one. R = orientation takes a vector from the body's axes to ground axes by R @ vector.
+        """
+        if isinstance(body, str):
+            return self.configuration.rotation[self.configuration.body(body)]
+        return self.configuration.axes(frame_of(body, "body"))
+
+    def point_velocity(self, point: BodyOrFrame) -> Float[Array, "3"]:
+        """Velocity of a point in ground axes [m/s]; see `point_position`."""
+        frame = frame_of(point, "point")
         body = self.configuration.body(frame.body)
         return self.velocity[body] + cross(self.angular_velocity[body], self.configuration.arm(frame))
 
@@ -101,9 +119,9 @@ class Motion(eqx.Module):
         omega = self.angular_velocity[body]
         return self.bias[body] + cross(self.angular_bias[body], arm) + cross(omega, cross(omega, arm))
 
-    def point_load(self, frame: Frame, force: Real[Array, "3"], moment: Real[Array, "3"] | float = 0.0) -> Load:
-        """Make the load of a force at a frame's origin, and a moment, in ground axes [N, N m]; none on the ground."""
-        return self.configuration.point_load(frame, force, moment)
+    def point_load(self, point: BodyOrFrame, force: Real[Array, "3"], moment: Real[Array, "3"] | float = 0.0) -> Load:
+        """Make the load of a force at a point, and a moment, in ground axes [N, N m]; none on the ground."""
+        return self.configuration.point_load(frame_of(point, "point"), force, moment)
 
 
 def _alone(values):

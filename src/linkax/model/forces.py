@@ -38,6 +38,7 @@ class Load(NamedTuple):
         return Load(*(a + b for a, b in zip(self, other, strict=True)))
 
 
+ENDED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)  # what a user's mistake raises
 GIVE_LOAD = "give a linkax.Load, made by motion.point_load, motion.joint_load or Load.none(motion.system)"
 
 
@@ -84,8 +85,8 @@ class AbstractForce(AbstractElement):
         """
         try:
             found = self.switch(t, motion)
-        except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
-            raise ValueError(f"{self.display_name}: its switch raises {raised(error)}") from error
+        except ENDED as error:
+            raise self._ended("switch", error, self.switch, (t, motion)) from error
         if not isinstance(found, jax.Array) or found.shape != () or not jnp.issubdtype(found.dtype, jnp.floating):
             raise ValueError(
                 f"{self.display_name}: its switch is {found!r}; give one number that depends on the motion"
@@ -102,8 +103,8 @@ class AbstractForce(AbstractElement):
             side = (self.switched(t, motion) > 0.0 if on is None else on,)
         try:
             found = self.load(t, motion, *side)
-        except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
-            raise ValueError(f"{self.display_name}: its load raises {raised(error)}") from error
+        except ENDED as error:
+            raise self._ended("load", error, self.load, (t, motion, *side)) from error
         whole = Load.none(motion.system)
         if not isinstance(found, Load):
             raise ValueError(f"{self.display_name}: its load is {found!r}; {GIVE_LOAD}")
@@ -115,6 +116,12 @@ class AbstractForce(AbstractElement):
                     f"and {right.dtype}; {GIVE_LOAD}"
                 )
         return found
+
+    def _ended(self, what, error, function, arguments):
+        """What to raise where the load or the switch has raised an error."""
+        if isinstance(error, ValueError) and str(error).startswith(self.display_name):
+            return error
+        return ValueError(f"{self.display_name}: its {what} raises {raised(error, function, arguments)}")
 
     def potential_energy(self, configuration: Configuration) -> Scalar:
         """Compute the potential energy [J]; zero for an element without one."""

@@ -1,6 +1,8 @@
 """Functions that users give to a mechanism: laws of drives and forces."""
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -13,6 +15,14 @@ from linkax.model.code import Code
 from linkax.model.numbers import Number, converted, number
 from linkax.xla.arrays import Array
 
+# What JAX raises where a function asks a traced number for its value.
+BY_TRACING = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.NonConcreteBooleanIndexError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+    jax.errors.UnexpectedTracerError,
+)
 Numbers = TypeVar("Numbers", bound=Array | np.floating)
 
 
@@ -56,7 +66,8 @@ class Law(eqx.Module):
         try:
             found = self.function(*arguments)
         except Exception as error:
-            raise ValueError(f"{self.what}: its function raises {raised(error)}") from error
+            told = raised(error, self.function.code.function, arguments)
+            raise ValueError(f"{self.what}: its function raises {told}") from error
         found = converted(found, f"{self.what}: what its function returns", jnp.asarray)
         if found.shape != self.shape:
             expected = "a single number" if self.shape == () else f"an array of shape {self.shape}"
@@ -64,11 +75,31 @@ class Law(eqx.Module):
         return found if jnp.issubdtype(found.dtype, jnp.floating) else 1.0 * found
 
 
-def raised(error: Exception) -> str:
-    """Describe what a user's function raised, and what often helps."""
+def raised(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
+    """Describe what a user's function raised for some arguments, and what helps."""
     first, *_ = str(error).split("\n")
-    remedy = "make it of operations of jax.numpy, with jnp.where in place of if"
-    return f"{type(error).__name__}: {first}; JAX traces it, so {remedy}"
+    return f"{type(error).__name__}: {first}{_remedy(error, function, arguments)}"
+
+
+def _remedy(error, function, arguments):
+    if isinstance(error, BY_TRACING):
+        return "; JAX traces it, so make it of operations of jax.numpy, with jnp.where in place of if"
+    if isinstance(error, ValueError):  # which says it
+        return ""
+    if isinstance(error, TypeError) and not _takes(function, arguments):
+        return f"; it must take {('t', '(t, motion)', '(t, motion, on)')[len(arguments) - 1]}"
+    known = get_close_matches(getattr(error, "name", None) or "", dir(getattr(error, "obj", None)), 3)
+    return f"; known: {', '.join(map(repr, known))}" if known else "; check it"
+
+
+def _takes(function, arguments):
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError:
+        return False
+    except ValueError:  # it has none
+        return True
+    return True
 
 
 def number_or_law(entry: Any, shape: tuple[int, ...], what: str) -> Array | Law:

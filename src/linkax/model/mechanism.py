@@ -18,7 +18,7 @@ from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import listed, read_only, require_bool
 from linkax.model.spanning_tree import SpanningTree, spanning_tree
-from linkax.model.topology import GROUND_INDEX, Topology
+from linkax.model.topology import GROUND_INDEX, Topology, find
 
 
 class Mechanism(eqx.Module):
@@ -83,26 +83,20 @@ class Mechanism(eqx.Module):
         **Raises:** `ValueError` for an unknown name.
         """
         names = (*self.topology.bodies, *(beam.name for beam in self.beams))
-        return (*self.bodies, *self.beams)[_find(name, names, "body")]
+        return (*self.bodies, *self.beams)[find(name, names, "body")]
 
     def joint(self, name: str) -> AbstractJoint:
         """Return the joint of that name.
 
         **Raises:** `ValueError` for an unknown name.
         """
-        return self.joints[_find(name, self.topology.joints, "joint")]
+        return self.joints[self.topology.joint_index(name)]
 
     def view(self, state: Any, path: str | os.PathLike | None = None, **settings: Any) -> Any:
         """Show the mechanism at a `linkax.State` in three dimensions; see `linkax.Solution.view`."""
         from linkax.simulation.read.solution import Solution
 
         return Solution.of_state(self, state).view(path, **settings)
-
-
-def _find(name: Any, names: tuple[str, ...], what: str) -> int:
-    if not isinstance(name, str) or name not in names:
-        raise ValueError(f"unknown {what} {name!r}; known: {', '.join(map(repr, names))}")
-    return names.index(name)
 
 
 def _listed(

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -12,6 +12,16 @@ from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
 from linkax.model.terms import Term
 
 GROUND_INDEX = -1
+
+
+def find(name: Any, names: Sequence[str], what: str) -> int:
+    """Find the index of a name among those of bodies, joints or others.
+
+    **Raises:** `ValueError` that lists the known names.
+    """
+    if not isinstance(name, str) or name not in names:
+        raise ValueError(f"unknown {what} {name!r}; known: {', '.join(map(repr, names)) or 'none'}")
+    return names.index(name)
 
 
 class JointGroup(NamedTuple):
@@ -69,6 +79,20 @@ class Topology:
     def num_bodies(self) -> int:
         """n_b."""
         return len(self.bodies)
+
+    def body_index(self, name: str) -> int:
+        """Find the index of a body, or of ground.
+
+        **Raises:** `ValueError` for an unknown name.
+        """
+        return GROUND_INDEX if name == GROUND_NAME else find(name, self.bodies, "body")
+
+    def joint_index(self, name: str) -> int:
+        """Find the index of a joint, in the tree or cut.
+
+        **Raises:** `ValueError` for an unknown name.
+        """
+        return find(name, self.joints, "joint")
 
     @cached_property
     def cut_types(self) -> tuple[type[AbstractJoint], ...]:
