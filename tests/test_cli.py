@@ -18,8 +18,8 @@ from linkax_command import parser, run
 
 KEYS = {
     "scene", "variant", "t1", "preset", "steps", "compile_s", "run_s", "position_violation",
-    "velocity_violation", "acceleration_violation", "energy_error", "rank_min", "rank_max", "result", "final",
-    "singularity_distance", "passages", "digits_lost",
+    "velocity_violation", "acceleration_violation", "energy_unaccounted", "work", "rank_min", "rank_max",
+    "result", "final", "singularity_distance", "passages", "digits_lost",
 }  # fmt: skip
 
 BAD = {
@@ -145,7 +145,15 @@ def test_summary_for_people(capsys, tmp_path):
     (tmp_path / "trajectory-interrupted.npz").write_text("of an earlier run")
     assert run(command) == 0
     printed = capsys.readouterr().out
-    for word in ("successful", "steps", "compile time", "run time", "position violation", "energy change", "bob"):
+    for word in (
+        "successful",
+        "steps",
+        "compile time",
+        "run time",
+        "position violation",
+        "energy unaccounted for",
+        "bob",
+    ):
         assert word in printed
     assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "trajectory.npz"}
 

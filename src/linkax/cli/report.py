@@ -14,11 +14,11 @@ Points = Mapping[str, tuple[str, str | None]]
 
 
 def summary(run: TimedRun, points: Points) -> dict[str, Any]:
-    """Steps, times, violations, energy error, rank, passages, result and final positions of a run, as JSON holds them.
+    """Steps, times, violations, energy, rank, passages, result and final positions of a run, as JSON holds them.
 
     - Violations are relative, see `Solution.worst_violation`.
-    - `energy_error`: largest change of the energy, relative to the largest kinetic energy; in joules where nothing
-      moves. It is an error only where no drive, damping or force that depends on time changes the energy.
+    - `energy_unaccounted`: largest change of the energy less the work of drives, dampers and other forces, relative to
+      the largest kinetic energy; in joules where nothing moves. `work`: of each until the end [J].
     - `singularity_distance`: the smallest at a saved time. `passages`: times through singular configurations [s].
       `digits_lost`: in these, see `Solution.passages`.
     - Numbers that are not finite, or not measured, are None.
@@ -28,9 +28,11 @@ def summary(run: TimedRun, points: Points) -> dict[str, Any]:
     solution = run.solution
     reached = np.isfinite(np.asarray(solution.ts))
     violation = solution.worst_violation()
-    energy, kinetic = np.asarray(solution.energy())[reached], np.asarray(solution.kinetic_energy())[reached]
+    kinetic, unaccounted = (
+        np.asarray(values)[reached] for values in (solution.kinetic_energy(), solution.unaccounted_energy())
+    )
     rank = np.asarray(solution.rank())[reached]
-    drift, scale = np.max(np.abs(energy - energy[:1]), initial=0.0), np.max(kinetic, initial=0.0)
+    drift, scale = np.max(np.abs(unaccounted), initial=0.0), np.max(kinetic, initial=0.0)
     passed = solution.passages()
     last = np.flatnonzero(reached)[-1] if np.any(reached) else 0
     return {
@@ -41,7 +43,8 @@ def summary(run: TimedRun, points: Points) -> dict[str, Any]:
         "position_violation": finite(violation.position),
         "velocity_violation": finite(violation.velocity),
         "acceleration_violation": finite(violation.acceleration),
-        "energy_error": finite(drift / scale if scale > 0.0 else drift),
+        "energy_unaccounted": finite(drift / scale if scale > 0.0 else drift),
+        "work": {name: finite(np.asarray(done)[last]) for name, done in solution.work().items()},
         "rank_min": int(np.min(rank, initial=rank[0] if len(rank) else 0)),
         "rank_max": int(np.max(rank, initial=0)),
         "singularity_distance": finite(np.min(np.asarray(solution.singularity_distance())[reached], initial=1.0)),

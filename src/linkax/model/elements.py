@@ -34,6 +34,13 @@ class AbstractElement(eqx.Module):
         """Names of the joints of `terms`."""
         return tuple(dict.fromkeys(along.joint for along in self.terms))
 
+    def extent(self, configuration: Configuration) -> Any:
+        """Compute the distance between its points, or along all of them [m], which `Solution.length` reads.
+
+        **Raises:** `ValueError` for an element without length.
+        """
+        raise ValueError(f"{self.display_name} has no length; give a spring, damper, rope or Distance")
+
     @property
     @abc.abstractmethod
     def display_name(self) -> str:

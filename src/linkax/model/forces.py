@@ -4,6 +4,7 @@ import abc
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -45,13 +46,16 @@ GIVE_LOAD = "give a linkax.Load, made by motion.point_load, motion.joint_load or
 class AbstractForce(AbstractElement):
     """A force element. To make your own, subclass it and define `load`.
 
-    Its fields that hold numbers are traced. `motion` is a `linkax.Motion`: it tells where all bodies are and how
-    they move at one instant, and makes loads on points and along joints. `motion.system` has the mechanism's numbers
-    in the order of its bodies.
+    `name`, if given, is unique among joints, constraints and forces, and names it in `Solution.force`, `length` and
+    `work`. Its fields that hold numbers are traced. `motion` is a `linkax.Motion`: it tells where all bodies are and
+    how they move at one instant, and makes loads on points and along joints. `motion.system` has the mechanism's
+    numbers in the order of its bodies.
 
     A load with a kink or a jump needs a `switch`, which is zero there, and takes the side as a third argument:
     `load(t, motion, on)`. Steps then end at the switch, and derivatives are right across it.
     """
+
+    name: str | None = eqx.field(static=True, default=None, kw_only=True)
 
     @property
     def needs_coordinate(self) -> bool:
@@ -60,7 +64,23 @@ class AbstractForce(AbstractElement):
 
     @property
     def display_name(self) -> str:
+        if self.name is not None:
+            return f"{type(self).__name__} {self.name!r}"
         return described(type(self).__name__, [repr(name) for name in self.joints] or named(self.frames))
+
+    @property
+    def conserves_energy(self) -> bool:
+        """Whether all of its work is the fall of its potential energy, whatever its numbers."""
+        return False
+
+    def strength(self, t: Time, motion: Motion, *args: Any) -> Any:
+        """Compute what `Solution.force` reads: one number, or three in ground axes; takes what `load` takes.
+
+        Springs, dampers and ropes have their pull [N], what acts along a joint its force on the child [N m or N].
+
+        **Raises:** `ValueError` where an element does not define it.
+        """
+        raise ValueError(f"{self.display_name} does not say which force it has; define strength(t, motion) for it")
 
     @abc.abstractmethod
     def load(self, t: Time, motion: Motion, *args: Any, **kwargs: Any) -> Load:
@@ -93,14 +113,16 @@ class AbstractForce(AbstractElement):
             )
         return found
 
+    def side(self, t: Time, motion: Motion) -> tuple[Any, ...]:
+        """Compute what `load` takes besides t and motion: whether the switch is positive, where there is one."""
+        return (self.switched(t, motion) > 0.0,) if has_switch(self) else ()
+
     def applied(self, t: Time, motion: Motion, on: Any = None) -> Load:
         """Compute the load and check it; `on`: see `load`, by default whether the switch is positive now.
 
         **Raises:** `ValueError` for a load that raises, is no `Load`, or has parts of another shape or type.
         """
-        side = ()
-        if has_switch(self):
-            side = (self.switched(t, motion) > 0.0 if on is None else on,)
+        side = self.side(t, motion) if on is None or not has_switch(self) else (on,)
         try:
             found = self.load(t, motion, *side)
         except ENDED as error:
@@ -133,6 +155,13 @@ def has_switch(force: AbstractForce) -> bool:
     return type(force).switch is not AbstractForce.switch
 
 
+def optional_name(name: Any, kind: str) -> str | None:
+    """Check the name of a force element, which may have none."""
+    if name is not None and (not isinstance(name, str) or not name):
+        raise ValueError(f"{kind}: name is {name!r}; give a non-empty string, or None")
+    return name
+
+
 def described(kind: str, of: list[str]) -> str:
     """Name an element in errors by its kind and what it acts on."""
     return f"{kind} on {' and '.join(of)}" if of else kind
@@ -153,6 +182,10 @@ class Gravity(AbstractForce):
 
     def __init__(self, acceleration: Vector) -> None:
         self.acceleration = number(acceleration, (3,), "Gravity: acceleration [m/s²]")
+
+    @property
+    def conserves_energy(self) -> bool:
+        return True
 
     def load(self, t: Time, motion: Motion) -> Load:
         none = Load.none(motion.system)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load
+from linkax.model.forces import AbstractForce, Load, optional_name
 from linkax.model.functions import Law, evaluated, number_or_law
 from linkax.model.numbers import Number, number, positive, zero_or_more
 from linkax.model.terms import Term, TermLike, term
@@ -25,11 +25,11 @@ class _AlongJoint(AbstractForce):
         return (self.joint,)
 
     @abc.abstractmethod
-    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+    def strength(self, t: Number, motion: Motion) -> Scalar:
         """Compute the torque or force along the joint, on the child [N m or N]."""
 
     def load(self, t: Number, motion: Motion) -> Load:
-        return motion.joint_load(self.joint, self.torque_at(t, motion))
+        return motion.joint_load(self.joint, self.strength(t, motion))
 
 
 class JointTorque(_AlongJoint):
@@ -40,15 +40,19 @@ class JointTorque(_AlongJoint):
     - `joint`: a joint's name, or (name, index) for one of several speeds.
     - `torque`: a number, or a function (t, motion) ↦ number, where `motion` is a `linkax.Motion`. What the
       function may read is as for `linkax.Drive`.
+    - `name`: see `linkax.AbstractForce`.
     """
 
     torque: Scalar | Law
 
-    def __init__(self, joint: TermLike, torque: Number | Callable[[Any, Any], Number]) -> None:
+    def __init__(
+        self, joint: TermLike, torque: Number | Callable[[Any, Any], Number], *, name: str | None = None
+    ) -> None:
+        self.name = optional_name(name, "JointTorque")
         self.joint = term(joint, "JointTorque")
-        self.torque = number_or_law(torque, (), f"JointTorque on {self.joint.joint!r}: torque [N m or N]")
+        self.torque = number_or_law(torque, (), f"{self.display_name}: torque [N m or N]")
 
-    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+    def strength(self, t: Number, motion: Motion) -> Scalar:
         return evaluated(self.torque, t, motion)
 
 
@@ -59,23 +63,27 @@ class JointSpring(_AlongJoint):
     spring forgets whole turns.
 
     **Arguments:** `joint`: a name, or (name, index); `stiffness` [N m/rad or N/m]; `free`: the
-    coordinate where it is unstrained [rad or m].
+    coordinate where it is unstrained [rad or m]; `name`, see `linkax.AbstractForce`.
     """
 
     stiffness: Scalar
     free: Scalar
 
-    def __init__(self, joint: TermLike, stiffness: Number, free: Number = 0.0) -> None:
+    def __init__(self, joint: TermLike, stiffness: Number, free: Number = 0.0, *, name: str | None = None) -> None:
+        self.name = optional_name(name, "JointSpring")
         self.joint = term(joint, "JointSpring")
-        what = f"JointSpring on {self.joint.joint!r}"
-        self.stiffness = number(stiffness, (), f"{what}: stiffness [N m/rad or N/m]")
-        self.free = number(free, (), f"{what}: free [rad or m]")
+        self.stiffness = number(stiffness, (), f"{self.display_name}: stiffness [N m/rad or N/m]")
+        self.free = number(free, (), f"{self.display_name}: free [rad or m]")
 
     @property
     def needs_coordinate(self) -> bool:
         return True
 
-    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+    @property
+    def conserves_energy(self) -> bool:
+        return True
+
+    def strength(self, t: Number, motion: Motion) -> Scalar:
         return -self.stiffness * motion.configuration.joint_displacement(self.joint, self.free)
 
     def potential_energy(self, configuration: Configuration) -> Scalar:
@@ -85,16 +93,18 @@ class JointSpring(_AlongJoint):
 class JointDamper(_AlongJoint):
     """Viscous damping along a joint: −damping × speed.
 
-    **Arguments:** `joint`: a name, or (name, index); `damping` [N m s/rad or N s/m].
+    **Arguments:** `joint`: a name, or (name, index); `damping` [N m s/rad or N s/m]; `name`, see
+    `linkax.AbstractForce`.
     """
 
     damping: Scalar
 
-    def __init__(self, joint: TermLike, damping: Number) -> None:
+    def __init__(self, joint: TermLike, damping: Number, *, name: str | None = None) -> None:
+        self.name = optional_name(name, "JointDamper")
         self.joint = term(joint, "JointDamper")
-        self.damping = number(damping, (), f"JointDamper on {self.joint.joint!r}: damping [N m s/rad or N s/m]")
+        self.damping = number(damping, (), f"{self.display_name}: damping [N m s/rad or N s/m]")
 
-    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+    def strength(self, t: Number, motion: Motion) -> Scalar:
         return -self.damping * motion.joint_rate(self.joint)
 
 
@@ -104,7 +114,8 @@ class JointFriction(_AlongJoint):
     Below `scale` it is nearly viscous, so a joint at rest under a load creeps; at 3 × scale it has 99.5 % of
     `torque`. The smaller the scale, the stiffer the motion.
 
-    **Arguments:** `joint`: a name, or (name, index); `torque` [N m or N]; `scale` [rad/s or m/s].
+    **Arguments:** `joint`: a name, or (name, index); `torque` [N m or N]; `scale` [rad/s or m/s]; `name`,
+    see `linkax.AbstractForce`.
 
     **Raises:** `ValueError` for a negative torque, or a scale that is not positive.
     """
@@ -112,11 +123,11 @@ class JointFriction(_AlongJoint):
     torque: Scalar
     scale: Scalar
 
-    def __init__(self, joint: TermLike, torque: Number, scale: Number) -> None:
+    def __init__(self, joint: TermLike, torque: Number, scale: Number, *, name: str | None = None) -> None:
+        self.name = optional_name(name, "JointFriction")
         self.joint = term(joint, "JointFriction")
-        what = f"JointFriction on {self.joint.joint!r}"
-        self.torque = zero_or_more(torque, f"{what}: torque [N m or N]")
-        self.scale = positive(scale, f"{what}: scale [rad/s or m/s]")
+        self.torque = zero_or_more(torque, f"{self.display_name}: torque [N m or N]")
+        self.scale = positive(scale, f"{self.display_name}: scale [rad/s or m/s]")
 
-    def torque_at(self, t: Number, motion: Motion) -> Scalar:
+    def strength(self, t: Number, motion: Motion) -> Scalar:
         return -self.torque * jnp.tanh(motion.joint_rate(self.joint) / self.scale)

@@ -85,6 +85,16 @@ class Mechanism(eqx.Module):
         names = (*self.topology.bodies, *(beam.name for beam in self.beams))
         return (*self.bodies, *self.beams)[find(name, names, "body")]
 
+    @property
+    def force_names(self) -> tuple[str, ...]:
+        """What to call each of `forces`: its name, else what it is and acts on, with a number for the second such."""
+        names = []
+        for force in self.forces:
+            name = force.name or force.display_name
+            again = sum(other == name or other.startswith(f"{name} (") for other in names)
+            names.append(f"{name} ({again + 1})" if again else name)
+        return tuple(names)
+
     def joint(self, name: str) -> AbstractJoint:
         """Return the joint of that name.
 
@@ -119,6 +129,8 @@ def _check_names(parts: Parts) -> dict[str, RigidBody]:
     """Check that names are unique and that all that elements refer to is there; return the bodies by name."""
     bodies, joints = _by_name(parts.bodies, "body"), _by_name(parts.joints, "joint")
     _by_name([*parts.joints, *parts.constraints], "joint or constraint")
+    forces = [force for force in parts.forces if force.name is not None]
+    _by_name([*parts.joints, *parts.constraints, *forces], "joint, constraint or force")
     _check_references(bodies, joints, parts.constraints, parts.forces)
     return bodies
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from linkax.model.bodies import GROUND_NAME, BodyOrFrame, Frame, frame_of
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load, described, named
+from linkax.model.forces import AbstractForce, Load, described, named, optional_name
 from linkax.model.functions import Law, evaluated, number_or_law
 from linkax.model.numbers import Number, Vector, number, one_of, zero_or_more
 from linkax.spatial.vectors import dot, length
@@ -30,6 +30,9 @@ class _BetweenPoints(AbstractForce):
     @property
     def frames(self) -> tuple[Frame, ...]:
         return (self.first, self.second)
+
+    def extent(self, configuration: Configuration) -> Scalar:
+        return length(configuration.between(self.first, self.second))
 
     @abc.abstractmethod
     def pull(self, motion: Motion) -> Float[Array, "3"]:
@@ -51,16 +54,32 @@ class Spring(_BetweenPoints):
     Where the points meet there is no direction, and it does not push.
 
     **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`;
-    `stiffness` [N/m]; `free_length` [m], zero or more.
+    `stiffness` [N/m]; `free_length` [m], zero or more; `name`, see `linkax.AbstractForce`.
     """
 
     stiffness: Scalar
     free_length: Scalar
 
-    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, stiffness: Number, free_length: Number = 0.0) -> None:
+    def __init__(
+        self,
+        first: BodyOrFrame,
+        second: BodyOrFrame,
+        stiffness: Number,
+        free_length: Number = 0.0,
+        *,
+        name: str | None = None,
+    ) -> None:
+        self.name = optional_name(name, "Spring")
         self.first, self.second = _frames("Spring", first, second)
         self.stiffness = number(stiffness, (), f"{self.display_name}: stiffness [N/m]")
         self.free_length = zero_or_more(free_length, f"{self.display_name}: free_length [m]")
+
+    @property
+    def conserves_energy(self) -> bool:
+        return True
+
+    def strength(self, t: Number, motion: Motion) -> Scalar:
+        return self.stiffness * (self.extent(motion.configuration) - self.free_length)
 
     def pull(self, motion: Motion) -> Float[Array, "3"]:
         along = motion.configuration.between(self.first, self.second)
@@ -75,19 +94,28 @@ class Spring(_BetweenPoints):
 class Damper(_BetweenPoints):
     """Viscous damping between two points, with the pull damping × rate of their distance.
 
-    **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`; `damping` [N s/m].
+    **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`; `damping` [N s/m];
+    `name`, see `linkax.AbstractForce`.
     """
 
     damping: Scalar
 
-    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, damping: Number) -> None:
+    def __init__(self, first: BodyOrFrame, second: BodyOrFrame, damping: Number, *, name: str | None = None) -> None:
+        self.name = optional_name(name, "Damper")
         self.first, self.second = _frames("Damper", first, second)
         self.damping = number(damping, (), f"{self.display_name}: damping [N s/m]")
 
+    def strength(self, t: Number, motion: Motion) -> Scalar:
+        return self.damping * self._rate(motion)[0]
+
     def pull(self, motion: Motion) -> Float[Array, "3"]:
-        direction = _unit(motion.configuration.between(self.first, self.second))
-        rate = dot(motion.point_velocity(self.second) - motion.point_velocity(self.first), direction)
+        rate, direction = self._rate(motion)
         return self.damping * rate * direction
+
+    def _rate(self, motion):
+        """Of the distance, and the direction along which it is."""
+        direction = _unit(motion.configuration.between(self.first, self.second))
+        return dot(motion.point_velocity(self.second) - motion.point_velocity(self.first), direction), direction
 
 
 class _OnPoint(AbstractForce):
@@ -96,7 +124,8 @@ class _OnPoint(AbstractForce):
     point: Frame
     axes: Axes = eqx.field(static=True)
 
-    def __init__(self, point: BodyOrFrame, axes: Axes) -> None:
+    def __init__(self, point: BodyOrFrame, axes: Axes, name: str | None) -> None:
+        self.name = optional_name(name, type(self).__name__)
         self.point = frame_of(point, f"{type(self).__name__}: point")
         if self.point.body == GROUND_NAME:
             raise ValueError(
@@ -121,18 +150,29 @@ class PointForce(_OnPoint):
     - `point`: a body (its reference frame), or `body.at(...)`.
     - `force`: three numbers [N], or a function (t, motion) ↦ three numbers; see `JointTorque`.
     - `axes`: "ground" (default), or "frame": those of the frame at the point, which turn with the body.
+    - `name`: see `linkax.AbstractForce`.
 
     **Raises:** `ValueError` for a point on the ground.
     """
 
     force: Float[Array, "3"] | Law
 
-    def __init__(self, point: BodyOrFrame, force: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground") -> None:
-        super().__init__(point, axes)
+    def __init__(
+        self,
+        point: BodyOrFrame,
+        force: Vector | Callable[[Any, Any], Vector],
+        axes: Axes = "ground",
+        *,
+        name: str | None = None,
+    ) -> None:
+        super().__init__(point, axes, name)
         self.force = number_or_law(force, (3,), f"{self.display_name}: force [N]")
 
+    def strength(self, t: Number, motion: Motion) -> Float[Array, "3"]:
+        return self._in_ground_axes(self.force, t, motion)
+
     def load(self, t: Number, motion: Motion) -> Load:
-        return motion.point_load(self.point, self._in_ground_axes(self.force, t, motion))
+        return motion.point_load(self.point, self.strength(t, motion))
 
 
 class PointMoment(_OnPoint):
@@ -144,14 +184,22 @@ class PointMoment(_OnPoint):
     moment: Float[Array, "3"] | Law
 
     def __init__(
-        self, point: BodyOrFrame, moment: Vector | Callable[[Any, Any], Vector], axes: Axes = "ground"
+        self,
+        point: BodyOrFrame,
+        moment: Vector | Callable[[Any, Any], Vector],
+        axes: Axes = "ground",
+        *,
+        name: str | None = None,
     ) -> None:
-        super().__init__(point, axes)
+        super().__init__(point, axes, name)
         self.moment = number_or_law(moment, (3,), f"{self.display_name}: moment [N m]")
+
+    def strength(self, t: Number, motion: Motion) -> Float[Array, "3"]:
+        return self._in_ground_axes(self.moment, t, motion)
 
     def load(self, t: Number, motion: Motion) -> Load:
         nothing = jnp.zeros(3, motion.system.dtype)
-        return motion.point_load(self.point, nothing, self._in_ground_axes(self.moment, t, motion))
+        return motion.point_load(self.point, nothing, self.strength(t, motion))
 
 
 def _frames(kind: str, first: BodyOrFrame, second: BodyOrFrame) -> tuple[Frame, Frame]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from linkax.model.bodies import AbstractBody, BodyOrFrame, Frame, frame_of
 from linkax.model.constraints import AbstractConstraint, checked_name
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load
+from linkax.model.forces import AbstractForce, Load, optional_name
 from linkax.model.functions import Law, evaluated, held_unless
 from linkax.model.numbers import Number, listed, positive, zero_or_more
 from linkax.spatial.vectors import dot, length
@@ -105,7 +105,10 @@ class Rope(AbstractConstraint):
 
     def value(self, configuration: Configuration) -> Scalar:
         """Compute minus its length [m]; with this sign its multiplier is the tension."""
-        return -jnp.sum(length(_spans(configuration, self.points)))
+        return -self.extent(configuration)
+
+    def extent(self, configuration: Configuration) -> Scalar:
+        return jnp.sum(length(_spans(configuration, self.points)))
 
     def load(self, configuration: Configuration, tension: Number) -> Load:
         """Compute its load on its points at a tension [N]."""
@@ -126,7 +129,8 @@ class ElasticRope(AbstractForce):
     Taut, it has the tension stiffness × stretch + damping × rate of stretch. With damping the tension jumps where it
     goes taut. Steps end where it goes taut or slack.
 
-    **Arguments:** `points`: see `Rope`; `stiffness` [N/m], E A / free_length; `free_length` [m]; `damping` [N s/m].
+    **Arguments:** `points`: see `Rope`; `stiffness` [N/m], E A / free_length; `free_length` [m]; `damping` [N s/m];
+    `name`, see `linkax.AbstractForce`.
 
     **Raises:** `ValueError` as for `Rope`, for a stiffness or free length that is not positive, and for a negative
     damping.
@@ -138,8 +142,15 @@ class ElasticRope(AbstractForce):
     damping: Scalar
 
     def __init__(
-        self, points: Iterable[BodyOrFrame], stiffness: Number, free_length: Number, damping: Number = 0.0
+        self,
+        points: Iterable[BodyOrFrame],
+        stiffness: Number,
+        free_length: Number,
+        damping: Number = 0.0,
+        *,
+        name: str | None = None,
     ) -> None:
+        self.name = optional_name(name, "ElasticRope")
         self.points = _points(points, "ElasticRope")
         self.stiffness = positive(stiffness, f"{self.display_name}: stiffness [N/m]")
         self.free_length = positive(free_length, f"{self.display_name}: free_length [m]")
@@ -149,8 +160,11 @@ class ElasticRope(AbstractForce):
     def frames(self) -> tuple[Frame, ...]:
         return self.points
 
+    def extent(self, configuration: Configuration) -> Scalar:
+        return jnp.sum(length(_spans(configuration, self.points)))
+
     def _stretch(self, configuration: Configuration) -> Scalar:
-        return jnp.sum(length(_spans(configuration, self.points))) - self.free_length
+        return self.extent(configuration) - self.free_length
 
     def _rate_of_stretch(self, motion: Motion) -> Scalar:
         along = _directions(_spans(motion.configuration, self.points))
@@ -162,10 +176,12 @@ class ElasticRope(AbstractForce):
         slower = self.damping / self.stiffness * self._rate_of_stretch(motion)
         return (stretch + jnp.minimum(slower, 0.0)) / self.free_length
 
-    def load(self, t: Number, motion: Motion, on: Any) -> Load:
+    def strength(self, t: Number, motion: Motion, on: Any) -> Scalar:
         stretch, rate = self._stretch(motion.configuration), self._rate_of_stretch(motion)
-        tension = self.stiffness * stretch + self.damping * rate
-        return _pull(motion.configuration, self.points, jnp.where(on, tension, 0.0))
+        return jnp.where(on, self.stiffness * stretch + self.damping * rate, 0.0)
+
+    def load(self, t: Number, motion: Motion, on: Any) -> Load:
+        return _pull(motion.configuration, self.points, self.strength(t, motion, on))
 
     def potential_energy(self, configuration: Configuration) -> Scalar:
         return self.stiffness * jnp.maximum(self._stretch(configuration), 0.0) ** 2 / 2.0

@@ -12,7 +12,10 @@ from jaxtyping import Float, Int, Shaped
 
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.model.beams import Beam
+from linkax.model.elements import AbstractElement
+from linkax.model.joints.distance import Distance
 from linkax.model.numbers import Number, Vector, number, one_of, real
+from linkax.model.topology import find
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
 from linkax.simulation.read.reading import read, read_in_motion
@@ -58,10 +61,11 @@ def of_body(function: Callable[..., Any], solution: Solution, body: str) -> Floa
     **Raises:** `ValueError` for an unknown body and for a beam.
     """
     found = solution.mechanism.body(body)
+    reader = read_in_motion if function is Observables.angular_acceleration else read
     if isinstance(found, Beam):
         some = ", ".join(map(repr, found.sections[:3]))
         raise ValueError(f"{body!r} is a beam and bends; ask for one of its sections, {some}, ...")
-    return read(function, solution, _index(solution, body))
+    return reader(function, solution, _index(solution, body))
 
 
 def of_joint(function: Callable[..., Any], solution: Solution, name: str) -> Float[Array, "..."]:
@@ -70,7 +74,8 @@ def of_joint(function: Callable[..., Any], solution: Solution, name: str) -> Flo
     **Raises:** `ValueError` for an unknown joint.
     """
     solution.mechanism.joint(name)
-    values = read(function, solution, name)
+    reader = read_in_motion if function is Observables.joint_acceleration else read
+    values = reader(function, solution, name)
     return values[..., 0] if values.shape[-1] == 1 else values
 
 
@@ -85,6 +90,42 @@ def reaction_of(function: Callable[..., Any], solution: Solution, name: str, on:
     index = solution.mechanism.topology.joints.index(name)
     force, moment = read_in_motion(function, solution, on, axes)
     return Reaction(force[..., index, :], moment[..., index, :])
+
+
+def force_of(solution: Solution, element: str | AbstractElement) -> Float[Array, "..."]:
+    """Read the strength of a force element, or the force of a constraint or a `Distance`.
+
+    **Raises:** `ValueError` for an unknown element, and for one that has no one force.
+    """
+    of, index = _place(solution, element)
+    if of == "forces":
+        return read(Observables.strength, solution, index)
+    if of == "joints":
+        return read_in_motion(Observables.tension, solution, index)
+    return of_constraint(Observables.constraint_forces, solution, solution.mechanism.topology.constraints[index])
+
+
+def length_of(solution: Solution, element: str | AbstractElement) -> Float[Array, "*batch n_t"]:
+    """Read the length of a force element, a constraint or a `Distance`.
+
+    **Raises:** `ValueError` for an unknown element, and for one without length.
+    """
+    return read(Observables.extent, solution, *_place(solution, element))
+
+
+def _place(solution, element):
+    """In which list of the mechanism an element is, and its index there."""
+    mechanism = solution.mechanism
+    forces, constraints, joints = mechanism.force_names, mechanism.topology.constraints, mechanism.topology.joints
+    rods = [joint.name for joint in mechanism.joints if isinstance(joint, Distance)]
+    name = element
+    if isinstance(element, AbstractElement | Distance):
+        name = getattr(element, "name", None) or element.display_name
+        if f"{name} (2)" in forces:
+            raise ValueError(f"there are several elements {name!r}; give each a name: Spring(..., name='strut')")
+    find(name, (*forces, *constraints, *rods), "force, constraint or Distance")
+    lists = {"forces": forces, "constraints": constraints, "joints": joints}
+    return next((of, names.index(name)) for of, names in lists.items() if name in names)
 
 
 def is_constraint(solution: Solution, name: str) -> bool:

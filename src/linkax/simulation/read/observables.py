@@ -5,11 +5,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import Configuration, along_speeds, beam_point, configure
 from linkax.equations.coordinates import rates
-from linkax.equations.dynamics import applied_load, body_accelerations, kinetic_energy, potential_energy
+from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
 from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
 from linkax.equations.motion import Motion, move
 from linkax.equations.reactions import Axes, Reaction, Side, reactions, reactions_to, seen_from
@@ -18,9 +19,10 @@ from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.least_multipliers import LeastMultipliers, least_multipliers
 from linkax.model.beams import Beam
+from linkax.model.mechanism import Mechanism
 from linkax.model.poses import Pose
 from linkax.spatial.rotations import rotate
-from linkax.spatial.vectors import cross, largest
+from linkax.spatial.vectors import cross, dot, largest, length
 from linkax.xla.arrays import Array, Scalar
 
 UNCHANGED = 1e-6  # by a self-stress of magnitude one
@@ -47,6 +49,12 @@ class Power(NamedTuple):
 
     forces: Float[Array, "..."]
     drives: Float[Array, "..."]
+
+
+def do_work(mechanism: Mechanism | System) -> tuple[list[int], list[int]]:
+    """Indices of the force elements that change the energy, and of the constraints that change with time."""
+    forces = [index for index, force in enumerate(mechanism.forces) if not force.conserves_energy]
+    return forces, [index for index, constraint in enumerate(mechanism.constraints) if constraint.is_driven]
 
 
 class Observables(NamedTuple):
@@ -123,11 +131,22 @@ class Observables(NamedTuple):
     def angular_velocity(self, body: Int[Array, ""]) -> Float[Array, "3"]:
         return self.motion.angular_velocity[body]
 
+    def angular_acceleration(self, body: Int[Array, ""]) -> Float[Array, "3"]:
+        return body_accelerations(self.motion, self.solved.acceleration)[0][body]
+
     def joint(self, name: str) -> Float[Array, " n"]:
         return self.configuration.joint_coordinates(name)
 
     def joint_speed(self, name: str) -> Float[Array, " n"]:
         return self.motion.joint_speeds(name)
+
+    def joint_acceleration(self, name: str) -> Float[Array, " n"]:
+        topology, system = self.system.topology, self.system
+        if name in topology.speeds:
+            return self.solved.acceleration[topology.speeds[name]]
+        speeds = lambda t, q, v: move(configure(system, t, q), v).joint_speeds(name)
+        changes = jnp.ones_like(self.t), rates(topology, self.q, self.v), self.solved.acceleration
+        return jax.jvp(speeds, (self.t, self.q, self.v), changes)[1]
 
     def _least_multipliers(self):
         multipliers = self.solved.multipliers
@@ -181,13 +200,42 @@ class Observables(NamedTuple):
         motion = self.motion
         return kinetic_energy(motion), potential_energy(motion.configuration)
 
+    def powers_of_forces(self) -> Float[Array, " n"]:
+        """Of each of the force elements that `do_work`, beyond the fall of its potential energy."""
+        motion, configuration, system = self.motion, self.configuration, self.system
+        forces = [system.forces[index] for index in do_work(system)[0]]
+        energies = lambda q: [force.potential_energy(configure(system, self.t, q)) for force in forces]
+        _, rises = jax.jvp(energies, (self.q,), (rates(system.topology, self.q, self.v),))
+        found = [jnp.zeros(0, self.q.dtype)]
+        for force, rise in zip(forces, rises, strict=True):
+            load = force.applied(self.t, motion)
+            along = load.joint_force + along_speeds(configuration, load.force, load.moment)
+            found.append((along @ self.v + rise)[None])
+        return jnp.concatenate(found)
+
+    def powers_of_drives(self) -> Float[Array, " n"]:
+        """Of each of the constraints that `do_work`."""
+        of_rows, (_, driven) = self.solved.multipliers * rate(self.system, self.t), do_work(self.system)
+        return of_rows[len(of_rows) - len(self.system.constraints) + np.array(driven, int)]
+
     def power(self) -> Power:
-        motion, configuration = self.motion, self.configuration
-        load = applied_load(motion)
-        force = load.joint_force + along_speeds(configuration, load.force, load.moment)
-        energy = lambda q: potential_energy(configure(self.system, self.t, q))
-        _, rise = jax.jvp(energy, (self.q,), (rates(self.system.topology, self.q, self.v),))
-        return Power(force @ self.v + rise, self.solved.multipliers @ rate(self.system, self.t))
+        return Power(jnp.sum(self.powers_of_forces()), jnp.sum(self.powers_of_drives()))
+
+    def strength(self, index: int) -> Float[Array, ""] | Float[Array, "3"]:
+        """Of a force element."""
+        force, motion = self.system.forces[index], self.motion
+        return force.strength(self.t, motion, *force.side(self.t, motion))
+
+    def tension(self, index: int) -> Float[Array, ""]:
+        """Of a `Distance`, by the index of its joint."""
+        apart = self.configuration.separation[index - self.system.topology.num_bodies]
+        return -dot(self.reactions("child", "ground").force[index], apart) / length(apart)
+
+    def extent(self, of: str, index: int) -> Float[Array, ""]:
+        """Length of a force element, a constraint or a `Distance`."""
+        if of == "joints":
+            return length(self.configuration.separation[index - self.system.topology.num_bodies])
+        return getattr(self.system, of)[index].extent(self.configuration)
 
     def violation_and_scales(self) -> tuple[Violation, Float[Array, ""], Float[Array, ""]]:
         """The violation, and the largest speed and acceleration of the joints [1/s, 1/s²]."""

@@ -1,7 +1,7 @@
 """Reading a solution: functions of `Observables` over all its times and members, each kept while the solution lives."""
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -49,10 +49,8 @@ def read(function: Callable[..., Any], solution: Solution, *details: Any, dynami
         program, *given = _asked(solution, function, dynamics, details)
         return program(*given)
 
-    named = all(isinstance(detail, str) for detail in details)
-    if not named or solution.ts.ndim > 1 or not all_concrete(solution):
-        return compute()
-    return _kept(solution, (function, *details), compute)
+    named = all(isinstance(detail, str | int) for detail in details)
+    return kept(solution, (function, *details), compute) if named else compute()
 
 
 def _asked(solution, function, dynamics, details):
@@ -79,15 +77,17 @@ class SavedMotion(NamedTuple):
 _of_solutions = {}  # what has been read from solutions that are alive, by their identity
 
 
-def _kept(solution, key, compute):
-    """What `compute` gives, once for a solution, while it lives: other names and readings ask for the same."""
+def kept(solution: Solution, key: Hashable, compute: Callable[[], Any]) -> Any:
+    """What `compute` gives, once for a run, while its solution lives: other names and readings ask for the same."""
+    if solution.ts.ndim > 1 or not all_concrete(solution):
+        return compute()
     if id(solution) not in _of_solutions:
         _of_solutions[id(solution)] = {}
         weakref.finalize(solution, _of_solutions.pop, id(solution))
-    kept = _of_solutions[id(solution)]
-    if key not in kept:
-        kept[key] = compute()
-    return kept[key]
+    found = _of_solutions[id(solution)]
+    if key not in found:
+        found[key] = compute()
+    return found[key]
 
 
 @Program

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.beams import Beam
+from linkax.model.elements import AbstractElement
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, number, require
 from linkax.model.poses import Pose
@@ -25,7 +26,9 @@ from linkax.simulation.integrate.results import REMARKS, RESULTS
 from linkax.simulation.integrate.run import Run, checked_formulation
 from linkax.simulation.read.by_name import (
     BodyPoint,
+    force_of,
     is_constraint,
+    length_of,
     of_body,
     of_constraint,
     of_joint,
@@ -34,7 +37,8 @@ from linkax.simulation.read.by_name import (
 )
 from linkax.simulation.read.observables import Observables, Power, Violation
 from linkax.simulation.read.passages import Passages, passages
-from linkax.simulation.read.reading import evaluate_dense, read, read_in_motion
+from linkax.simulation.read.reading import evaluate_dense, kept, read, read_in_motion
+from linkax.simulation.read.work import work
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
 from linkax.xla.arrays import Array
@@ -180,6 +184,10 @@ class Solution(eqx.Module):
         """Angular velocity of a body [rad/s]."""
         return of_body(Observables.angular_velocity, self, body)
 
+    def angular_acceleration(self, body: str) -> Float[Array, "*batch n_t 3"]:
+        """Angular acceleration of a body [rad/s²]."""
+        return of_body(Observables.angular_acceleration, self, body)
+
     def poses(self) -> dict[str, Pose]:
         """Reference frames of all bodies by name, of a beam those of its sections: what an animation needs."""
         origin, axes = read(Observables.poses, self)
@@ -193,6 +201,10 @@ class Solution(eqx.Module):
     def joint_speed(self, name: str) -> Float[Array, "..."]:
         """Speed of a joint, in the tree or cut [rad/s or m/s]."""
         return of_joint(Observables.joint_speed, self, name)
+
+    def joint_acceleration(self, name: str) -> Float[Array, "..."]:
+        """Rate of a joint's speed, in the tree or cut [rad/s² or m/s²]."""
+        return of_joint(Observables.joint_acceleration, self, name)
 
     def strain(self, beam: str) -> Float[Array, "*batch n_t n 6"]:
         """Strains of a beam at its nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
@@ -255,6 +267,41 @@ class Solution(eqx.Module):
     def power(self) -> Power:
         """The rate of `energy`, by what causes it [W], each (n_t,)."""
         return read_in_motion(Observables.power, self)
+
+    def work(self) -> dict[str, Float[Array, "*batch n_t"]]:
+        """Work of each element that puts energy in or takes it out, since the first saved time [J], (n_t,), by name.
+
+        These are force elements beyond the fall of their potential energy (dampers, torques, forces of your own), by
+        `Mechanism.force_names`, and constraints that change with time (drives, winches). Between saved times the motion
+        is interpolated, with an error of work in proportion to the sixth power of the time between them.
+        """
+        return kept(self, "work", lambda: work(self))
+
+    def unaccounted_energy(self) -> Float[Array, "*batch n_t"]:
+        """Change of `energy` since the first saved time, less all `work` [J]: an error.
+
+        It is that of the integration, and of `work` where saved times are far apart or forces jump between them.
+        """
+        change = self.energy()
+        return change - change[..., :1] - sum(self.work().values(), jnp.zeros_like(change))
+
+    def force(self, element: str | AbstractElement) -> Float[Array, "..."]:
+        """Force of one element, (n_t,).
+
+        The pull [N] of a `Spring`, `Damper`, `ElasticRope`, `Rope` or `Distance`, negative where it pushes; the force
+        on the child along the joint [N m or N] of a `JointSpring` and its like, or of a `Drive`. Of `PointForce` and
+        `PointMoment` three numbers in ground axes, (n_t, 3).
+
+        **Arguments:** `element`: its name, one of `mechanism.force_names`, a constraint or a `Distance`; or the element
+        itself.
+
+        **Raises:** `ValueError` for an unknown element, and for one that does not say which force it has.
+        """
+        return force_of(self, element)
+
+    def length(self, element: str | AbstractElement) -> Float[Array, "*batch n_t"]:
+        """Length of a `Spring`, `Damper`, `ElasticRope`, `Rope` or `Distance` [m]; see `force`."""
+        return length_of(self, element)
 
     def violation(self) -> Violation:
         """Largest violation of the loop rows at each time."""
