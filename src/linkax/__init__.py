@@ -120,6 +120,7 @@ from linkax.studies.shooting import Shots as Shots  # noqa: E402
 from linkax.studies.shooting import shoot as shoot  # noqa: E402
 from linkax.studies.sweep import sweep as sweep  # noqa: E402
 from linkax.studies.sweep_result import Sweep as Sweep  # noqa: E402
+from linkax.xla.program_cache import cache_programs as cache_programs  # noqa: E402
 
 if _TYPE_CHECKING:
     from linkax import plot as plot

@@ -4,6 +4,9 @@ import argparse
 import sys
 import warnings
 from collections.abc import Callable
+from typing import Any, cast
+
+import jax
 
 import linkax as lx
 from linkax.cli.compare import run_compare
@@ -24,7 +27,17 @@ def run(arguments: argparse.Namespace, at_interrupt: Callable[[Callable[[], str]
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: print(f"linkax: {message}", file=sys.stderr)
+            _cache_programs()
             return COMMANDS[arguments.command](arguments, at_interrupt)
     except lx.SimulationError as error:
         print(f"linkax: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
+
+
+def _cache_programs():
+    """Keep compiled programs for the next command, unless the environment says otherwise."""
+    if cast(Any, jax.config).jax_enable_compilation_cache:
+        try:
+            lx.cache_programs()
+        except ValueError as error:
+            warnings.warn(f"{error} by JAX_COMPILATION_CACHE_DIR", stacklevel=2)

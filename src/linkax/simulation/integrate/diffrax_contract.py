@@ -7,12 +7,20 @@ linkax tells a step control more: how close the stages of a step came to a singu
   the stages are d there, and its end value the mean;
 - in the error, which is a `StepError` where diffrax has a vector like y: only `MechanismControl` reads it;
 - in the solver's state, which is a `SolverState`: the saved one tells the smallest d of all stages.
+
+diffrax checks that times are in order, and calls back to Python where they are not; of a program with such a call JAX
+keeps nothing on disk. linkax has checked its times, and leaves these checks out, see `times_in_order`.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, NamedTuple, cast
 
 import diffrax
+import equinox.internal as eqxi
 import jax.numpy as jnp
+from diffrax import _integrate as diffrax_integrate
 from jax import lax
 from jaxtyping import Float
 
@@ -82,3 +90,29 @@ def closest(solution: diffrax.Solution) -> Float[Array, ""]:
     """The smallest d at any stage of a diffrax solution that saved the solver's state."""
     state: Any = solution.solver_state
     return state.closest
+
+
+_in_order = ContextVar("times_in_order", default=False)
+
+
+@contextmanager
+def times_in_order() -> Iterator[None]:
+    """Meanwhile `diffrax.diffeqsolve` does not check times."""
+    before = _in_order.set(True)
+    try:
+        yield
+    finally:
+        _in_order.reset(before)
+
+
+class _Internals:
+    """`equinox.internal` as diffrax sees it."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(eqxi, name)
+
+    def error_if(self, x: Any, *check: Any) -> Any:
+        return x if _in_order.get() else eqxi.error_if(x, *check)
+
+
+cast(Any, diffrax_integrate).eqxi = _Internals()

@@ -86,22 +86,23 @@ def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bo
         ((saveat.subs, end, steps) if track else (saveat.subs, end), True),
         is_leaf=lambda leaf: leaf is None,
     )
-    solution: Any = diffrax.diffeqsolve(
-        diffrax.ODETerm(derivative),
-        integrator.solver,
-        ivp.t0,
-        ivp.t1,
-        integrator.dt0,
-        ivp.y0,
-        ivp.problem,
-        saveat=saveat,
-        stepsize_controller=integrator.controller,
-        adjoint=integrator.adjoint,
-        event=integrator.event,
-        max_steps=integrator.max_steps,
-        throw=False,
-        progress_meter=integrator.progress_meter,
-    )
+    with diffrax_contract.times_in_order():
+        solution: Any = diffrax.diffeqsolve(
+            diffrax.ODETerm(derivative),
+            integrator.solver,
+            ivp.t0,
+            ivp.t1,
+            integrator.dt0,
+            ivp.y0,
+            ivp.problem,
+            saveat=saveat,
+            stepsize_controller=integrator.controller,
+            adjoint=integrator.adjoint,
+            event=integrator.event,
+            max_steps=integrator.max_steps,
+            throw=False,
+            progress_meter=integrator.progress_meter,
+        )
     (ts, t_end, *times), (ys, y_end, *states) = solution.ts, solution.ys
     average = lax.stop_gradient(diffrax_contract.integral_of_distance(y_end[0]) / (t_end[0] - ivp.t0))
     closest = diffrax_contract.closest(solution)
