@@ -239,5 +239,11 @@ def test_spatial_mechanisms_are_seen_from_a_corner(name):
         assert len(outline) < 2 or np.linalg.norm(length) > 0.1
 
 
-def test_planar_motion_is_seen_in_its_plane(crank_slider):
+def test_planar_motion_is_seen_in_its_plane_unless_from_above(crank_slider):
     assert scenery_of(crank_slider[0], {}).camera.plane == (0, 1)
+    door = lx.box("door", [1.0, 0.05, 2.0], mass=20.0)
+    hinge = lx.Revolute("hinge", lx.GROUND, door.at([-0.5, 0.0, 0.0]), axis="z")
+    for gravity, plane in ([0.0, 0.0, -9.81], None), ([0.0, 0.0, 0.0], (0, 1)):
+        mechanism = lx.Mechanism([door], [hinge], [lx.Gravity(gravity)])
+        turning = lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": 0.0}, {"hinge": 1.0}), t1=1.0)
+        assert scenery_of(turning, {}).camera.plane == plane

@@ -62,8 +62,8 @@ def _filmed(figure, axes, actors, count) -> list[Image.Image]:
 
 def _moments(solution) -> np.ndarray:
     """The times of the frames [s]."""
-    times = solution.ts
-    turning = np.abs(solution.v[:, ~solution.mechanism.topology.slides])
+    times, v = np.asarray(solution.ts), np.asarray(solution.v)
+    turning = np.abs(v[:, ~solution.mechanism.topology.slides])
     fastest = np.maximum.accumulate(np.max(turning, axis=1, initial=0.0))
     turns = fastest * (times - times[0]) / (MOST_FRAMES - 1)
     last = max(1, int(np.sum(turns <= LARGEST_TURN)) - 1)

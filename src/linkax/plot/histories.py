@@ -8,7 +8,7 @@ cell. All raise `ValueError` for an unknown name, and for the solution of a batc
 import numpy as np
 from matplotlib.figure import Figure
 
-from linkax.scenery.colours import BLUE, GREEN, INK, VERMILION
+from linkax.scenery.colours import BLUE, GREEN, INK, VERMILION, body_colour
 from linkax.scenery.scenery import reached
 from linkax.simulation.read.by_name import BodyPoint
 from linkax.simulation.read.solution import Solution
@@ -110,18 +110,27 @@ def singularity(solution: Solution) -> Figure:
 
 
 def energy(solution: Solution) -> Figure:
-    """Plot kinetic, potential and total energy [J], and below the change of the total, against time [s]."""
+    """Plot kinetic, potential and total energy [J] against time [s], the work that changes it, and what is left over.
+
+    Work is shown where drives, dampers, torques or other forces do some, see `Solution.work`.
+    """
     solution = reached(solution)
     kinetic, potential = np.asarray(solution.kinetic_energy()), np.asarray(solution.potential_energy())
-    total = kinetic + potential
-    figure, (energies, change) = _panels("Energy", 2)
+    total, works = kinetic + potential, solution.work()
+    figure, panels = _panels("Energy", 2 + bool(works))
     for label, values, colour in (("kinetic", kinetic, BLUE), ("potential", potential, VERMILION)):
-        energies.plot(solution.ts, values, color=colour, label=label)
-    energies.plot(solution.ts, total, color=INK, label="total", linestyle="--")
-    energies.set_ylabel("energy [J]")
-    _add_legend(figure, energies)
-    change.plot(solution.ts, total - total[0], color=INK)
-    change.set_ylabel("change of\ntotal energy [J]")
+        panels[0].plot(solution.ts, values, color=colour, label=label)
+    panels[0].plot(solution.ts, total, color=INK, label="total", linestyle="--")
+    panels[0].set_ylabel("energy [J]")
+    if works:
+        for index, (name, values) in enumerate(works.items()):
+            panels[1].plot(solution.ts, values, color=body_colour(index), label=f"work of {name}")
+        panels[1].plot(solution.ts, total - total[0], color=INK, label="change of the total", linestyle="--")
+        panels[1].set_ylabel("work [J]")
+        panels[1].legend(frameon=False, fontsize="small")
+    panels[-1].plot(solution.ts, solution.unaccounted_energy(), color=INK)
+    panels[-1].set_ylabel("energy not\naccounted for [J]")
+    _add_legend(figure, panels[0])
     return figure
 
 

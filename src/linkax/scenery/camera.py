@@ -29,14 +29,15 @@ class Camera(NamedTuple):
 
 
 def camera_for(mechanism: Mechanism, everything: Float[np.ndarray, "n n_f 3"]) -> Camera:
-    """See a planar motion along its normal, where that is a ground axis, and all else from a corner.
+    """See a planar motion along its normal, where that is a level ground axis, and all else from a corner.
 
     `everything`: the positions of all that is drawn, in n_f frames [m].
     """
     extents = np.ptp(everything.reshape(-1, 3), axis=0)
     moves = np.max(np.ptp(everything, axis=1), axis=0)
     flat = moves if np.any(moves > NEGLIGIBLE * max(extents)) else extents
-    still = np.flatnonzero(flat <= NEGLIGIBLE * max(flat))
+    fall = np.abs(gravity(mechanism))
+    still = np.flatnonzero((flat <= NEGLIGIBLE * max(flat)) & (fall <= NEGLIGIBLE * max(fall)))
     if not len(still):
         return _corner(upwards(mechanism))
     normal = min(still.tolist(), key=lambda axis: (extents[axis], -axis))

@@ -110,6 +110,8 @@ def reached(solution: Solution) -> Solution:
     if np.ndim(solution.ts) != 1:
         raise ValueError(f"the solution is a batch of shape {np.shape(solution.ts)[:-1]}; draw one of its members")
     there = np.isfinite(np.asarray(solution.ts))
+    if np.all(there):
+        return solution  # which keeps what was read of it
     if not np.any(there):
         raise ValueError("the solution has no time that was reached; there is nothing to draw")
     kept = {name: np.asarray(getattr(solution, name))[there] for name in ("ts", "q", "v")}
@@ -118,7 +120,7 @@ def reached(solution: Solution) -> Solution:
 
 def _between(saved, moments) -> Solution:
     """The solution at other times, by Hermite interpolation of the joints' coordinates."""
-    times, q, v = saved.ts, saved.q, saved.v
+    times, q, v = (np.asarray(values) for values in (saved.ts, saved.q, saved.v))
     left = np.clip(np.searchsorted(times, moments, side="right") - 1, 0, len(times) - 2)
     width = (times[left + 1] - times[left])[:, None]
     s = (moments - times[left])[:, None] / width
