@@ -187,12 +187,12 @@ def spans(mechanism: Mechanism) -> list[Span]:
     for rope in mechanism.constraints:
         if isinstance(rope, Rope):
             found.append(Span("rod" if len(rope.points) == 2 else "rope", f"{rope.name}: Rope", rope.points))
-    for force in mechanism.forces:
+    for name, force in zip(mechanism.force_names, mechanism.forces, strict=True):
+        label = f"{name}: {type(force).__name__}" if force.name else name
         if isinstance(force, Spring | Damper):
-            kind = "spring" if isinstance(force, Spring) else "damper"
-            found.append(Span(kind, force.display_name, (force.first, force.second)))
+            found.append(Span("spring" if isinstance(force, Spring) else "damper", label, (force.first, force.second)))
         if isinstance(force, ElasticRope):
-            found.append(Span("rope", force.display_name, force.points))
+            found.append(Span("rope", label, force.points))
     for beam in mechanism.beams:
         sections = (mechanism.body(section) for section in beam.sections)
         found.append(Span("beam", f"{beam.name}: Beam", tuple(section.reference for section in sections)))
