@@ -7,7 +7,7 @@ from pathlib import Path
 
 import linkax as lx
 
-LATE = ("scipy", "zarr", "matplotlib", "optax", "PIL", "tqdm", "fsspec")
+LATE = ("scipy", "zarr", "matplotlib", "optax", "PIL", "fsspec")
 SOURCE = Path(lx.__file__).parents[1]
 
 

@@ -16,6 +16,7 @@ from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.rosenbrock import Rodas5P
 from linkax.simulation.integrate.runge_kutta import RungeKutta4
 from linkax.studies.files import remove_unfinished, writable_folder, written_whole
+from linkax.xla.waiting import end_line, is_watched, tell
 
 OF_DIFFRAX = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno5")
 SOLVERS = {name.lower(): getattr(diffrax, name) for name in OF_DIFFRAX} | {
@@ -147,17 +148,16 @@ def _changes(assignments) -> dict[str, str]:
 
 def progress(phase: str, fraction: float | None) -> None:
     """Show the current phase, and the fraction done where it is known; in a terminal on one line."""
-    text = phase if fraction is None else f"{phase} {100 * fraction:.0f} %"
-    if sys.stderr.isatty():
-        print(f"\r{text:<60}", end="", file=sys.stderr, flush=True)
+    if is_watched():
+        tell(phase if fraction is None else f"{phase} {100 * fraction:.0f} %")
     elif fraction is None or fraction == 0.0:
         print(f"{phase} ...", file=sys.stderr, flush=True)
 
 
 def end_progress() -> None:
     """Clear the line that shows the progress."""
-    if sys.stderr.isatty():
-        print("\r" + 60 * " " + "\r", end="", file=sys.stderr)
+    if is_watched():
+        end_line()
 
 
 def steps_in_words(described: dict[str, Any]) -> str:

@@ -19,8 +19,8 @@ from linkax.model.numbers import require_type
 from linkax.studies.files import writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
 from linkax.studies.free_parameters import FreeParameters
-from linkax.studies.progress import progress_bar
 from linkax.xla.arrays import Array
+from linkax.xla.waiting import Progress, compiling
 
 FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
 Mode = Literal["forward", "reverse"]
@@ -155,19 +155,21 @@ def run_search(
     of another fit.
     """
     z = search.free.start
-    found = search.evaluated(z, None, args)
-    state = _begin(search, z, found)
+    with compiling():
+        found = search.evaluated(z, None, args)
+        state = _begin(search, z, found)
     losses, best, best_z, waited = [], np.inf, z, 0
     kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, state, args, found)
     if kept is not None and kept.path.exists():
         (z, best_z, state), losses, waited = kept.load((z, best_z, state))
         best, found = min(losses), None
     ended = None
-    with progress_bar(steps, "step", progress, initial=len(losses)) as bar:
+    with Progress(steps, "step", progress) as line:
         while ended is None and len(losses) < steps + 1:
             before = z
             found = search.evaluated(z, state, args) if found is None else found
-            z, state, loss, smooth, done = _step(search, z, state, args, found)
+            with compiling(not losses):
+                z, state, loss, smooth, done = _step(search, z, state, args, found)
             loss, found = float(loss), None
             if not losses:
                 _check_start(loss, smooth)
@@ -175,9 +177,7 @@ def run_search(
             here = z if isinstance(search, Squares) else before
             waited = 0 if not np.isfinite(best) or loss < best - tolerance * abs(best) else waited + 1
             best, best_z = (loss, here) if loss <= best else (best, best_z)
-            bar.set_description("fitting")
-            bar.set_postfix(loss=f"{loss:.6g}")
-            bar.update()
+            line.tell("fitting", len(losses), f", loss {loss:.6g}")
             if kept is not None:
                 kept.save((z, best_z, state), losses, waited)
             ended = _ending(loss, smooth, done, patience is not None and waited >= patience)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from linkax.model.numbers import is_finite, real, require
 from linkax.studies.parameters import AbstractParameter
-from linkax.studies.progress import path_parts
+from linkax.studies.paths import path_parts
 from linkax.xla.arrays import Array
 
 

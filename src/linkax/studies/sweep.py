@@ -20,11 +20,11 @@ from linkax.model.numbers import real, require_type, whole_number
 from linkax.simulation.integrate.results import REMARKS, WARNINGS
 from linkax.simulation.read.solution import Solution
 from linkax.studies.parameters import as_arrays
-from linkax.studies.progress import progress_bar
 from linkax.studies.sweep_program import SweepProgram, is_struct
 from linkax.studies.sweep_result import FINE, NOT_RUN, Sweep
 from linkax.studies.sweep_store import SweepStore
 from linkax.xla.enumerations import code, is_item, item
+from linkax.xla.waiting import Progress, compiling
 
 DEFAULT_CHUNK = 256  # members on one device; larger chunks take no less time for each member
 DEFAULT_MEMORY = 2**31  # bytes
@@ -81,16 +81,17 @@ def sweep(
     if store is not None:
         folder = SweepStore.folder(require_type(store, str | os.PathLike, "store", "give the name of a folder"))
         SweepStore.check("params", params)
-    with progress_bar(count, "member", progress, smoothing=0.05) as bar:
+    with Progress(count, "member", progress) as line:
         one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), params)
-        shape = eqx.filter_eval_shape(function, one)
+        with compiling():
+            shape = eqx.filter_eval_shape(function, one)
         if folder is not None:
             SweepStore.check("output", eqx.filter(shape, is_struct))
         order = _order(difficulty, params, count, dict(chunk=chunk, memory=memory, devices=devices))
-        program = SweepProgram.compiled(function, one, shape, chunk or min(DEFAULT_CHUNK, count), memory, devices)
-        bar.set_description("sweeping")
+        with compiling():
+            program = SweepProgram.compiled(function, one, shape, chunk or min(DEFAULT_CHUNK, count), memory, devices)
         kept = None if folder is None else SweepStore.opened(folder, program, params, order, NOT_RUN)
-        results, seconds, ran = _run(program, params, order, kept, bar)
+        results, seconds, ran = _run(program, params, order, kept, line)
     arrays, reasons = results if jax.process_count() == 1 else _gathered(results)
     back = np.argsort(order)
     output = eqx.combine(jax.tree.map(lambda array: array[back], arrays), program.static)
@@ -153,7 +154,7 @@ def _order(difficulty, params, count, options):
     return np.argsort(-np.nan_to_num(difficulty, nan=np.inf), kind="stable")
 
 
-def _run(program, params, order, kept, bar):
+def _run(program, params, order, kept, line):
     """(outputs, reasons) in the order of running, the time that it took [s], and the number of members that ran."""
     count = len(order)
     starts = range(0, count, program.size)
@@ -170,7 +171,7 @@ def _run(program, params, order, kept, bar):
         return start, jax.tree.map(np.asarray, program.run(values))
 
     failed = int(np.sum(~np.isin(reasons, [*FINE, NOT_RUN])))
-    bar.update(sum(min(program.size, count - start) for start in done))
+    finished = sum(min(program.size, count - start) for start in done)
     left = [start for start in own if start not in done]
     began, ran = time.perf_counter(), 0
     for start, computed in _in_parallel(compute, left, program.workers):
@@ -181,9 +182,8 @@ def _run(program, params, order, kept, bar):
         if kept is not None:
             kept.save(start, part, computed)
         ran += part.stop - part.start
-        bar.update(part.stop - part.start)
         failed += int(np.sum(~np.isin(reasons[part], FINE)))
-        bar.set_postfix(failed=failed)
+        line.tell("sweeping", finished + ran, f", {failed} failed" if failed else "")
     elapsed = time.perf_counter() - began
     if kept is not None and jax.process_count() > 1:
         multihost_utils.sync_global_devices("sweep")

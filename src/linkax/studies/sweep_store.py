@@ -12,7 +12,7 @@ import numpy as np
 
 from linkax.studies.files import synced, writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
-from linkax.studies.progress import path_parts
+from linkax.studies.paths import path_parts
 from linkax.studies.sweep_program import SweepProgram
 
 FORMAT = 2

@@ -31,6 +31,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.flat import Flat
 from linkax.xla.tracing import Program, all_concrete, blank_result, concrete, is_first, jit_inline
 from linkax.xla.undefined import undefined_where
+from linkax.xla.waiting import compiling
 
 
 class Outcome(NamedTuple):
@@ -46,7 +47,7 @@ def integrate_run(run: Run) -> Outcome:
     """Integrate a run, in three programs: another solver, formulation or saveat compiles no more than it must."""
     given = run.flat, run.state, run.t0, run.tangent_space
     if all_concrete(run) and is_first(run.mechanism.topology, run.flat.noted):
-        with ThreadPoolExecutor() as threads:
+        with compiling(), ThreadPoolExecutor() as threads:
             # While XLA compiles one program, in a thread, Python traces the next.
             threads.submit(_check_start.lower(*given).compile)
             initial = blank_result(_check_start, *given)

@@ -24,6 +24,7 @@ from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.flat import Flat
 from linkax.xla.tracing import Program, all_concrete, blank_result, is_first
+from linkax.xla.waiting import compiling
 
 FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
 
@@ -32,7 +33,7 @@ def read_in_motion(function: Callable[..., Any], solution: Solution, *details: A
     """Read a function that needs v̇ or λ: these are solved by one program for all such functions, and passed in."""
     flat = solution.run.flat
     if solution.q is not None and all_concrete(solution) and is_first(function, flat.tree.topology, flat.noted):
-        with ThreadPoolExecutor() as threads:
+        with compiling(), ThreadPoolExecutor() as threads:
             program, *given = _asked(solution, Observables.solve, (), ())
             threads.submit(program.lower(*given).compile)
             program, *given = _asked(solution, function, blank_result(program, *given), details)

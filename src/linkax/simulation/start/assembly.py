@@ -36,7 +36,8 @@ from linkax.simulation.start.validation import (
 from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array
 from linkax.xla.static_scatter import scatter_static
-from linkax.xla.tracing import Program, all_concrete, jit_inline, without_derivatives
+from linkax.xla.tracing import Program, all_concrete, is_first, jit_inline, without_derivatives
+from linkax.xla.waiting import compiling
 
 
 class AssemblyError(ValueError):
@@ -98,7 +99,9 @@ def assemble(
     measured = places.measured()
     held, begin = (coordinates_by_joint(measured, *given) for given in ((positions, "position"), (guess, "guess")))
     moving = speeds_by_joint(measured, speeds, "speed")
-    state, remainder = _assembled(flat_with_known(measured), held, moving, begin, t)
+    given = flat_with_known(measured), held, moving, begin, t
+    with compiling(all_concrete(given) and is_first(assemble, jax.tree.structure(given))):
+        state, remainder = _assembled(*given)
     if not all_concrete((state, remainder)):
         return _marked(mechanism, state, remainder)
     remainder = jax.tree.map(np.asarray, remainder)
