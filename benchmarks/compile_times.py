@@ -5,9 +5,16 @@ joint: by how much the first of equal runs takes longer than the others; `run_ms
 gradient: likewise the derivative of M1n's end after 1 s by the mass of its rod, with the assembly of its start and from
 a given start. programs: compiled as one each, simulations and their gradients: the crank-slider SC1 over 10 s;
 Bricard's mechanism over 1 s; and a row of four four-bars over 1 s with twenty parameters: masses and inertias of nine
-bodies, gravity, angle at the start.
+bodies, gravity, angle at the start. processes: wall time of whole processes, medians: imports, answers of the command
+line, and the README's crank-slider from the start of Python to a reaction, for the first time and with the programs
+that an earlier process has kept.
 """
 
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
 import time
 from functools import partial
 
@@ -24,6 +31,32 @@ from linkax.scenes import SCENES
 SCENE = SCENES["crank-slider"]
 REPEATS = 7
 FIRST_RUNS = (("crank-slider", {}), ("bricard", {}), *(("n-four-bar", {"N": count}) for count in (5, 10, 20, 40)))
+
+
+PROCESSES = {
+    "import jax, diffrax": "import jax, diffrax",
+    "import linkax": "import linkax",
+    **{
+        f"linkax {asked}": f"import linkax_command; linkax_command.run({asked.split()})"
+        for asked in ("list", "simulate crank-slidr")
+    },
+}
+CRANK_SLIDER = """
+import sys
+import jax, jax.numpy as jnp, linkax as lx
+lx.cache_programs(sys.argv[1])
+crank, rod = lx.rod("crank", length=1.0, mass=1.0), lx.rod("rod", length=1.5, mass=1.0)
+slider = lx.point_mass("slider", mass=1.0)
+joints = [
+    lx.Revolute("bearing", lx.GROUND, crank.at("base"), axis="z"),
+    lx.Revolute("crank_pin", crank.at("tip"), rod.at("base"), axis="z"),
+    lx.Revolute("wrist_pin", rod.at("tip"), slider, axis="z"),
+    lx.Prismatic("guide", lx.GROUND, slider, axis="x"),
+]
+mechanism = lx.Mechanism([crank, rod, slider], joints, [lx.Gravity([0.0, -9.81, 0.0])])
+state = lx.assemble(mechanism, {"bearing": jnp.pi / 4}, {"bearing": 0.0})
+jax.block_until_ready(lx.simulate(mechanism, state, t1=2.0).reaction("wrist_pin"))
+"""
 
 
 def motion(numbers, accuracy):
@@ -140,5 +173,24 @@ def programs():
     yield {"program": "20 parameters, gradient over run", "ratio": round(ratio, 1)}
 
 
+def processes():
+    settings = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE", "EQX_ON_ERROR")
+    environment = {name: value for name, value in os.environ.items() if name not in settings}
+
+    def seconds(program, *arguments):
+        command = [sys.executable, "-c", program, *arguments]
+        return seconds_of(lambda: subprocess.run(command, capture_output=True, env=environment, check=True).returncode)
+
+    # By turns, since others may use the machine.
+    waits = [{name: seconds(program) for name, program in PROCESSES.items()} for _ in range(REPEATS)]
+    for name in PROCESSES:
+        yield {"process": name, "wall_s": round(statistics.median(wait[name] for wait in waits), 2)}
+    with tempfile.TemporaryDirectory() as folder:
+        yield {"process": "crank-slider, for the first time", "wall_s": round(seconds(CRANK_SLIDER, folder), 2)}
+        again = statistics.median(seconds(CRANK_SLIDER, folder) for _ in range(REPEATS))
+        yield {"process": "crank-slider, again", "wall_s": round(again, 2)}
+
+
 if __name__ == "__main__":
-    print_parts(__doc__, {"first-runs": first_runs, "gradient": gradients, "programs": programs})
+    parts = {"first-runs": first_runs, "gradient": gradients, "programs": programs, "processes": processes}
+    print_parts(__doc__, parts)
