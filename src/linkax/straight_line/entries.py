@@ -17,7 +17,8 @@ class NotStraight(Exception):
 def each(function: Callable[..., int], *arrays: Entries) -> Entries:
     """Apply a function of scalars to each entry of arrays of one shape, or of scalars beside them."""
     made: dict[tuple[int, ...], int] = {}
-    arrays = tuple(np.broadcast_arrays(*arrays))
+    if len({array.shape for array in arrays}) > 1:
+        arrays = np.broadcast_arrays(*arrays)  # which takes its time
     found = np.empty(arrays[0].size, dtype=int)
     for place, operands in enumerate(zip(*(array.ravel().tolist() for array in arrays), strict=True)):
         entry = made.get(operands)
