@@ -11,6 +11,9 @@ What we rely on (where; since which version), and what happens without it:
   products call a library: up to twice the time.
 - the name "xla_cpu_small_call" in a compiled program (`flags`; jaxlib 0.10). Without it: loops are taken for slow,
   and the warning comes.
+- the name `eqxi` in diffrax's module of `diffeqsolve`, by which it checks times (`diffrax_contract`; diffrax 0.7.2).
+  Without it: programs call back to Python, so that JAX keeps none of a run on disk; a warning says so.
+- events of JAX's cache (`program_cache`; jax 0.10). Without them: the warning comes for each program, or never.
 - compiler options `xla_backend_optimization_level` and the like (`flags`; jaxlib 0.10). Without it: programs that run
   once compile twice as long.
 

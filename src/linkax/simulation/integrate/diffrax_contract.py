@@ -12,6 +12,7 @@ diffrax checks that times are in order, and calls back to Python where they are 
 keeps nothing on disk. linkax has checked its times, and leaves these checks out, see `times_in_order`.
 """
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -20,7 +21,6 @@ from typing import Any, NamedTuple, cast
 import diffrax
 import equinox.internal as eqxi
 import jax.numpy as jnp
-from diffrax import _integrate as diffrax_integrate
 from jax import lax
 from jaxtyping import Float
 
@@ -115,4 +115,5 @@ class _Internals:
         return x if _in_order.get() else eqxi.error_if(x, *check)
 
 
-cast(Any, diffrax_integrate).eqxi = _Internals()
+if (module := sys.modules.get(diffrax.diffeqsolve.__module__)) is not None:
+    cast(Any, module).eqxi = _Internals()
