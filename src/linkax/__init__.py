@@ -100,6 +100,7 @@ from linkax.simulation.read.observables import Power as Power  # noqa: E402
 from linkax.simulation.read.observables import Violation as Violation  # noqa: E402
 from linkax.simulation.read.solution import Solution as Solution  # noqa: E402
 from linkax.simulation.simulate import simulate as simulate  # noqa: E402
+from linkax.simulation.start.assemblies import assemblies as assemblies  # noqa: E402
 from linkax.simulation.start.assembly import AssemblyError as AssemblyError  # noqa: E402
 from linkax.simulation.start.assembly import AssemblyWarning as AssemblyWarning  # noqa: E402
 from linkax.simulation.start.assembly import assemble as assemble  # noqa: E402

@@ -13,7 +13,7 @@ import linkax as lx
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # x to y
 DRAWN = {"lx.rod_between": lx.rod_between, "RigidBody.placed": lx.RigidBody.placed}
-JOINTS = {"lx.Free": lx.Free, "lx.Rectangular": lx.Rectangular}
+OTHERS = {"lx.Free": lx.Free, "lx.Rectangular": lx.Rectangular, "lx.assemblies": lx.assemblies}
 
 
 def run(documented):
@@ -24,14 +24,17 @@ def run(documented):
     return names
 
 
-@pytest.mark.parametrize("name", DRAWN | JOINTS)
+@pytest.mark.parametrize("name", DRAWN | OTHERS)
 def test_examples_of_docstrings_run(name):
-    names = run((DRAWN | JOINTS)[name])
+    names = run((DRAWN | OTHERS)[name])
     if name == "lx.rod_between":
         np.testing.assert_allclose(names["state"].q, 0.0, atol=1e-12)
     if name == "lx.Free":
         tip = lx.Solution.of_state(names["robot"], names["state"]).position("wrist", at="tip")[0]
         np.testing.assert_allclose(tip[:2], [0.8, 0.7], atol=1e-9)
+    if name == "lx.assemblies":
+        tip = lambda state: lx.Solution.of_state(names["four_bar"], state).position("rocker", at="tip")[0, 1]
+        assert tip(names["up"]) > 0.0 > tip(names["down"])
     if name == "lx.Rectangular":
         found = lx.Solution.of_state(names["table"], names["state"])
         np.testing.assert_allclose(found.position("puck")[0], [0.2, 0.3, 0.0], atol=1e-15)

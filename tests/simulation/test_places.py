@@ -8,7 +8,7 @@ from refusals import refused
 
 import linkax as lx
 from benchmarks.assembly import share
-from benchmarks.linkages import LINKAGES
+from benchmarks.linkages import LINKAGES, hidden
 
 FAR = np.array([1e6, 0.0, 0.0])  # where it stands
 NONE = np.zeros(3)
@@ -104,3 +104,29 @@ def test_what_is_wrong_is_named():
 def test_rough_places_lead_to_the_mode_drawn(name, count):
     (row,) = share(name, count)
     assert row["drawn"] >= 0.98
+
+
+def test_assemblies_are_counted_as_textbooks_do():
+    """Of Jansen's leg, which is three dyads with two modes each."""
+    leg = hidden(LINKAGES["Jansen leg"]())
+    assert len(lx.assemblies(leg.mechanism, leg.held)) == 8
+
+
+def test_assemblies_of_one_that_turns_anyhow_and_one_that_can_move():
+    """A coupler between balls closes an arm and a slide in two ways, however it spins."""
+    arm, slider = lx.rod("arm", 0.5, 1.0), lx.point_mass("slider", 1.0)
+    coupler = lx.rod("coupler", 1.0, 1.0, thickness=0.1)
+    joints = [
+        lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z"),
+        lx.Spherical("near", arm.at("tip"), coupler.at("base")),
+        lx.Spherical("far", coupler.at("tip"), slider),
+        lx.Prismatic("guide", lx.GROUND.at([0.0, 0.0, 0.2]), slider, axis="x"),
+    ]
+    mechanism = lx.Mechanism([arm, coupler, slider], joints)
+    found = lx.assemblies(mechanism, {"hinge": 1.0})
+    places = [state.q[mechanism.topology.coordinates["guide"]][0] for state in found]
+    half = np.sqrt(1.0 - 0.2**2 - (0.5 * np.sin(1.0)) ** 2)
+    np.testing.assert_allclose(sorted(places), 0.5 * np.cos(1.0) + half * np.array([-1.0, 1.0]), atol=1e-9)
+    with pytest.warns(lx.AssemblyWarning, match="can move with the positions held, in 1 ways"):
+        lx.assemblies(lx.Mechanism([arm], joints[:1]))
+    refused(lambda: lx.assemblies(mechanism, tries=0), "tries", "0")

@@ -290,6 +290,25 @@ class Topology:
             root[body] = body if carrier == GROUND_INDEX else root[carrier]
         return root
 
+    @cached_property
+    def spinning(self) -> dict[int, tuple[int, int]]:
+        """Bodies between two balls, which can spin about the line between these whatever all others do.
+
+        With the joints of each, which hold no more than its distances from the two points.
+        """
+        hung = {body: [] for body in range(self.num_bodies)}
+        for joint, kind in enumerate(self.joint_types):
+            rotates = getattr(kind, "locked_rotations", None) == () and not kind.combined_rotations
+            moves = {*getattr(kind, "locked_translations", ()), *kind.combined_translations}
+            for end in {self.parent[joint], self.child[joint]} & {*hung} if moves or not rotates else ():
+                hung[end].append((joint, rotates and len(moves) == 3))
+        held = {body for bodies in self.constraint_bodies for body in bodies}
+        return {
+            body: (joints[0][0], joints[1][0])
+            for body, joints in hung.items()
+            if len(joints) == 2 and all(spins for _, spins in joints) and body not in held
+        }
+
     def with_measures(self, measures: Sequence[AbstractJoint]) -> "Topology":
         """The same plan with joints that close loops without rows, and only measure."""
         index = {GROUND_NAME: GROUND_INDEX} | {name: place for place, name in enumerate(self.bodies)}

@@ -1,6 +1,7 @@
 """Consistent states from partial positions and speeds."""
 
 import warnings
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,7 +23,7 @@ from linkax.simulation.start.initial_state import ON_BRANCH, moving_joints
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import beams_of, rank_tolerance
 from linkax.simulation.start.places import Places, called
-from linkax.simulation.start.rough_start import rough_start
+from linkax.simulation.start.rough_start import given_in_tree, rough_start
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import (
     WorldMotion,
@@ -209,9 +210,10 @@ def _assembled(*given):
 
 @Program
 def _assemble(flat, positions, speeds, guess, t, *, branches):
-    demand, begin = _demand(flat, positions, guess, t)
+    demand, begin = demand_of(flat, positions, guess, t)
     if (rough := guess.of_cuts()).groups:
-        begin = rough_start(*lax.stop_gradient((demand, rough, begin)), _given(demand, guess))
+        given = given_in_tree(demand.system.topology, guess, positions)
+        begin = rough_start(*lax.stop_gradient((demand, rough, begin)), given)
     q = close_loops(demand, begin, None)
     system, configuration = demand.system, configure(demand.system, t, q)
     found = (speeds_on_branch if branches else smallest_speeds)(configuration, speeds)
@@ -241,12 +243,12 @@ def _assemble(flat, positions, speeds, guess, t, *, branches):
 def _assembled_again(given, q, branches):
     """The state whose coordinates are known, for its derivatives."""
     flat, positions, speeds, guess, t = given
-    demand, begin = _demand(flat, positions, guess, t)
+    demand, begin = demand_of(flat, positions, guess, t)
     q = close_loops(demand, begin, q)
     return State(q, speeds_again(configure(demand.system, t, q), speeds, branches))
 
 
-def _demand(flat, positions, guess, t):
+def demand_of(flat: Any, positions: JointValues, guess: JointValues, t: Array) -> tuple[LoopClosure, Array]:
     """The problem of closing the loops, and the coordinates where the search begins."""
     system = system_of(flat.tree, jnp.result_type(float), known=flat.noted)
     topology = system.topology
@@ -256,12 +258,3 @@ def _demand(flat, positions, guess, t):
             if alike.in_tree:
                 q = scatter_static(q, alike.in_q(topology), rows)
     return LoopClosure(system, t, positions), on_manifold(topology, q)
-
-
-def _given(demand, guess):
-    """Which coordinates of joints in the tree are given, (n_v,), one for each speed."""
-    topology = demand.system.topology
-    groups = [alike for alike in (*guess.groups, *demand.held.groups) if alike.in_tree]
-    terms = [along for alike in groups for along in alike.terms]
-    columns = [topology.columns_of(along) for along in terms]
-    return np.isin(np.arange(topology.num_speeds), np.concatenate([np.zeros(0, int), *columns]))

@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Bool, Float
 
 from linkax.equations.coordinates import retract, speeds
+from linkax.model.topology import Topology
 from linkax.simulation.start.closing import LONGEST_STEP, LoopClosure
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import strains_of
@@ -33,7 +34,9 @@ def rough_start(
     tree, as given or where frames coincide; `given`: which of them are given.
     """
     system, fit = demand.system, _Fit.of(demand, rough, begin, given)
-    starts = jax.vmap(lambda aside: retract(system.topology, begin, aside))(beside(demand, given, STARTS))
+    starts = jax.vmap(lambda aside: retract(system.topology, begin, aside))(
+        beside(demand, given, anywhere(STARTS, len(given)))
+    )
     found, misses = jax.vmap(fit.descend)(starts)
     return unwound(demand, found[jnp.argmin(misses)], begin)
 
@@ -90,13 +93,27 @@ class _Fit(eqx.Module):
         return found, missed
 
 
-def beside(demand: LoopClosure, given: Bool[np.ndarray, " n_v"], count: int) -> Float[Array, "{count} n_v"]:
-    """Changes that lead from one guess to many, the first of them zero: any angles, and lengths of the mechanism."""
+def anywhere(count: int, size: int, seed: int = 0) -> Float[np.ndarray, "{count} {size}"]:
+    """Random numbers from -1 to 1, with a first row of zeros."""
+    numbers = np.random.default_rng(seed).uniform(-1.0, 1.0, size=(count, size))
+    numbers[0] = 0.0
+    return numbers
+
+
+def beside(
+    demand: LoopClosure, given: Bool[np.ndarray, " n_v"], numbers: Float[Array, "count n_v"]
+) -> Float[Array, "count n_v"]:
+    """Changes that lead from one guess to many, by numbers from -1 to 1: any angles, and lengths of the mechanism."""
     system = demand.system
-    anywhere = np.random.default_rng(0).uniform(-1.0, 1.0, size=(count, len(given)))
-    anywhere[0] = 0.0
-    anywhere[:, given | np.isin(np.arange(len(given)), strains_of(system))] = 0.0
-    return jnp.where(system.topology.slides, system.length, np.pi) * anywhere
+    still = given | np.isin(np.arange(len(given)), strains_of(system))
+    return jnp.where(still, 0.0, jnp.where(system.topology.slides, system.length, np.pi) * numbers)
+
+
+def given_in_tree(topology: Topology, *values: JointValues) -> Bool[np.ndarray, " n_v"]:
+    """Which coordinates of joints in the tree have values, one for each speed."""
+    groups = [alike for of in values for alike in of.groups if alike.in_tree]
+    columns = [topology.columns_of(along) for alike in groups for along in alike.terms]
+    return np.isin(np.arange(topology.num_speeds), np.concatenate([np.zeros(0, int), *columns]))
 
 
 def unwound(demand: LoopClosure, q: Float[Array, " n_q"], begin: Float[Array, " n_q"]) -> Float[Array, " n_q"]:
