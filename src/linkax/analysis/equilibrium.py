@@ -95,9 +95,10 @@ def equilibrium(mechanism: Mechanism, state: State, *, t: ArrayLike = 0.0) -> St
     reached, ending = _equilibrium(mechanism, state, t, moves)
     if not moves:
         # Concrete inside transformations too: whoever reads the state sees that nothing moves.
-        reached = State(reached.q, evaluate_now(jnp.zeros, reached.v.shape, reached.v.dtype))
+        reached = State(reached.q, evaluate_now(jnp.zeros, reached.v.shape, reached.v.dtype), state.topology)
     if not all_concrete((reached, ending)):
-        return State(marked(mechanism, jnp.where(ending.is_sound, reached.q, jnp.nan)), reached.v)
+        q = marked(mechanism, jnp.where(ending.is_sound, reached.q, jnp.nan))
+        return State(q, reached.v, state.topology)
     _check_steady(mechanism, ending, reached, t)
     if not ending.gap <= CLOSED:
         raise EquilibriumError(
@@ -155,7 +156,7 @@ def _equilibrium(mechanism, state, t, moves):
     unstable = search.lowest < 0.0
     circulatory = unstable & (search.circulation > -search.lowest)
     ending = _Ending(search.longest, gap, unstable & ~circulatory, circulatory, missed, changes)
-    return State(q, v), lax.stop_gradient(ending)
+    return State(q, v, system.topology), lax.stop_gradient(ending)
 
 
 def _changes(system, method, t, q, v):

@@ -24,6 +24,7 @@ from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.integrate.run import cast
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked, speeds_by_joint
+from linkax.tables import Rows, Table, numbers, printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import Program, concrete
 
@@ -33,6 +34,12 @@ MET = 1e-9  # error up to which an acceleration counts as reached, relative to t
 MET_ULPS = 1e3  # the same in units of rounding, which is more in single precision
 
 
+def _table(found: "InverseDynamics") -> Table:
+    rows = [(f"{key}", numbers(forces, "N m or N", 1)) for key, forces in found.forces.items()]
+    return Table("Forces along joints", [Rows(("joint", "force"), rows, "joints")])
+
+
+@printed_as(_table)
 class InverseDynamics(NamedTuple):
     """Forces along joints, and the accelerations that they produce.
 

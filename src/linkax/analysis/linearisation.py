@@ -4,8 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Complex, Float
 
+from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
 
@@ -29,6 +31,22 @@ def _spectrum_jvp(primals, tangents):
     return (values, vectors), (jnp.diagonal(rotated), vectors @ mixed)
 
 
+def _table(found: "Linearisation") -> Table:
+    values = known(found.natural_frequencies)
+    shape, rows = (
+        found.natural_frequencies.shape,
+        [("natural frequencies", numbers(found.natural_frequencies, "rad/s", 1))],
+    )
+    if values is not None:
+        each = [values[..., mode] for mode in range(shape[-1])]
+        grows = lambda of: f"grows by {numbers(-of, '1/s')}"
+        hertz = lambda of: grows(of) if np.all(of < 0.0) else numbers(of / (2.0 * np.pi), "Hz")
+        rows = [(str(mode + 1), numbers(of, "rad/s"), hertz(of)) for mode, of in enumerate(each)]
+    title = f"Small motions in {count(shape[-1], 'mode')}" + batch(shape[:-1])
+    return Table(title, [Rows(("mode", "natural frequency", ""), rows, "modes")])
+
+
+@printed_as(_table)
 class Linearisation(NamedTuple):
     """Small motions about a state, v = T ẏ on the tangent space: ÿ + D ẏ + K y = 0.
 

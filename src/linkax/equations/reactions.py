@@ -15,12 +15,22 @@ from linkax.equations.tree_sums import expand_to_motions, over_subtree, sum_by_b
 from linkax.model.forces import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross
+from linkax.tables import Table, among, by_axis, printed_as
 from linkax.xla.arrays import Array
 
 Side = Literal["child", "parent"]
 Axes = Literal["ground", "joint"]
 
 
+def _table(reaction: "Reaction") -> Table:
+    decided = reaction.force.dtype == bool
+    title = "Components of a reaction that are unique" if decided else "Reaction"
+    units = ("", "") if decided else ("N", "N m")
+    rows = zip(("force", "moment"), reaction, units, strict=True)
+    return Table(title + among(reaction.force.shape[:-1]), [by_axis(*rows)])
+
+
+@printed_as(_table)
 class Reaction(NamedTuple):
     """The wrench of a joint on its child, in ground axes unless asked for otherwise.
 

@@ -4,7 +4,6 @@ import abc
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -46,16 +45,14 @@ GIVE_LOAD = "give a linkax.Load, made by motion.point_load, motion.joint_load or
 class AbstractForce(AbstractElement):
     """A force element. To make your own, subclass it and define `load`.
 
-    `name`, if given, is unique among joints, constraints and forces, and names it in `Solution.force`, `length` and
-    `work`. Its fields that hold numbers are traced. `motion` is a `linkax.Motion`: it tells where all bodies are and
-    how they move at one instant, and makes loads on points and along joints. `motion.system` has the mechanism's
-    numbers in the order of its bodies.
+    A field `name: str = equinox.field(static=True)`, if it has one, is unique among joints, constraints and forces, and
+    names it in `Solution.force`, `length` and `work`. Its other fields that hold numbers are traced. `motion` is a
+    `linkax.Motion`: it tells where all bodies are and how they move at one instant, and makes loads on points and
+    along joints. `motion.system` has the mechanism's numbers in the order of its bodies.
 
     A load with a kink or a jump needs a `switch`, which is zero there, and takes the side as a third argument:
     `load(t, motion, on)`. Steps then end at the switch, and derivatives are right across it.
     """
-
-    name: str | None = eqx.field(static=True, default=None, kw_only=True)
 
     @property
     def needs_coordinate(self) -> bool:
@@ -64,8 +61,8 @@ class AbstractForce(AbstractElement):
 
     @property
     def display_name(self) -> str:
-        if self.name is not None:
-            return f"{type(self).__name__} {self.name!r}"
+        if name := given_name(self):
+            return f"{type(self).__name__} {name!r}"
         return described(type(self).__name__, [repr(name) for name in self.joints] or named(self.frames))
 
     @property
@@ -155,11 +152,9 @@ def has_switch(force: AbstractForce) -> bool:
     return type(force).switch is not AbstractForce.switch
 
 
-def optional_name(name: Any, kind: str) -> str | None:
-    """Check the name of a force element, which may have none."""
-    if name is not None and (not isinstance(name, str) or not name):
-        raise ValueError(f"{kind}: name is {name!r}; give a non-empty string, or None")
-    return name
+def given_name(force: AbstractForce) -> str | None:
+    """The name that a force element was given."""
+    return getattr(force, "name", None)
 
 
 def described(kind: str, of: list[str]) -> str:

@@ -8,8 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load, optional_name
+from linkax.model.forces import AbstractForce, Load
 from linkax.model.functions import Law, evaluated, number_or_law
+from linkax.model.names import optional_name
 from linkax.model.numbers import Number, number, positive, zero_or_more
 from linkax.model.terms import Term, TermLike, term
 from linkax.xla.arrays import Scalar
@@ -18,6 +19,7 @@ from linkax.xla.arrays import Scalar
 class _AlongJoint(AbstractForce):
     """A torque, or a force on a slide, along one speed of a joint; its opposite acts on the parent."""
 
+    name: str | None = eqx.field(static=True)
     joint: Term = eqx.field(static=True)
 
     @property

@@ -10,24 +10,28 @@ import equinox as eqx
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
 from linkax.model.constraints import AbstractConstraint
+from linkax.model.description import described
 from linkax.model.discretisation import Parts, discretise_beams, tree_joints_first
-from linkax.model.forces import AbstractForce
+from linkax.model.forces import AbstractForce, given_name
 from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
+from linkax.model.names import find
 from linkax.model.numbers import listed, read_only, require_bool
 from linkax.model.spanning_tree import SpanningTree, spanning_tree
-from linkax.model.topology import GROUND_INDEX, Topology, find
+from linkax.model.topology import GROUND_INDEX, Topology
+from linkax.tables import printed_as
 
 
+@printed_as(described)
 class Mechanism(eqx.Module):
     """Bodies connected by joints, with the constraints and forces on them.
 
     The spanning tree and the cut joints are found here, whatever the order of the joints: joints first that a
-    constraint relates or a force acts along, then breadth first from ground.
-    `print(mechanism.topology.describe())` shows the tree; `cut=True` cuts a joint. Bodies and joints are kept in
-    the order of the tree.
+    constraint relates or a force acts along, then breadth first from ground. `print(mechanism)` shows all in tables,
+    `print(mechanism.topology.describe())` the tree; `cut=True` cuts a joint. Bodies and joints are kept in the order of
+    the tree.
 
     A beam becomes sections, bodies with names such as "boom[2.5]" (counted in elements from the base), and a
     massless body at each place that something attaches to. `beams` holds the beams as given.
@@ -50,7 +54,7 @@ class Mechanism(eqx.Module):
     joints: tuple[AbstractJoint, ...]
     forces: tuple[AbstractForce, ...]
     constraints: tuple[AbstractConstraint, ...]
-    topology: Topology = eqx.field(static=True)
+    topology: Topology = eqx.field(static=True, repr=False)
 
     def __init__(
         self,
@@ -90,7 +94,7 @@ class Mechanism(eqx.Module):
         """What to call each of `forces`: its name, else what it is and acts on, with a number for the second such."""
         names = []
         for force in self.forces:
-            name = force.name or force.display_name
+            name = given_name(force) or force.display_name
             again = sum(other == name or other.startswith(f"{name} (") for other in names)
             names.append(f"{name} ({again + 1})" if again else name)
         return tuple(names)
@@ -129,7 +133,7 @@ def _check_names(parts: Parts) -> dict[str, RigidBody]:
     """Check that names are unique and that all that elements refer to is there; return the bodies by name."""
     bodies, joints = _by_name(parts.bodies, "body"), _by_name(parts.joints, "joint")
     _by_name([*parts.joints, *parts.constraints], "joint or constraint")
-    forces = [force for force in parts.forces if force.name is not None]
+    forces = [force for force in parts.forces if given_name(force)]
     _by_name([*parts.joints, *parts.constraints, *forces], "joint, constraint or force")
     _check_references(bodies, joints, parts.constraints, parts.forces)
     return bodies

@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from linkax.model.bodies import GROUND_NAME, BodyOrFrame, Frame, frame_of
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load, described, named, optional_name
+from linkax.model.forces import AbstractForce, Load, described, named
 from linkax.model.functions import Law, evaluated, number_or_law
+from linkax.model.names import optional_name
 from linkax.model.numbers import Number, Vector, number, one_of, zero_or_more
 from linkax.spatial.vectors import dot, length
 from linkax.xla.arrays import Array, Scalar
@@ -24,6 +25,7 @@ Axes = Literal["ground", "frame"]
 class _BetweenPoints(AbstractForce):
     """A force along the line between the origins of two frames."""
 
+    name: str | None = eqx.field(static=True)
     first: Frame
     second: Frame
 
@@ -121,6 +123,7 @@ class Damper(_BetweenPoints):
 class _OnPoint(AbstractForce):
     """A vector on a point of a body, in ground axes or in those of the frame at the point."""
 
+    name: str | None = eqx.field(static=True)
     point: Frame
     axes: Axes = eqx.field(static=True)
 

@@ -2,7 +2,21 @@
 
 from typing import Any, NamedTuple
 
+import numpy as np
 
+from linkax.tables import Table, among, by_axis, known, printed_as
+
+
+def _table(pose):
+    rows = [("position", pose.position, "m")]
+    if pose.orientation is not None:
+        axes = known(pose.orientation)
+        columns = [pose.orientation if axes is None else axes[..., column] for column in range(3)]
+        rows += [(f"{name} axis", column, "") for name, column in zip("xyz", columns, strict=True)]
+    return Table("Pose of a frame, along ground axes" + among(np.shape(pose.position)[:-1]), [by_axis(*rows)])
+
+
+@printed_as(_table)
 class Pose(NamedTuple):
     """Pose of a body's reference frame in the world.
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -11,8 +12,9 @@ from jaxtyping import Float
 from linkax.model.bodies import AbstractBody, BodyOrFrame, Frame, frame_of
 from linkax.model.constraints import AbstractConstraint, checked_name
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load, optional_name
+from linkax.model.forces import AbstractForce, Load
 from linkax.model.functions import Law, evaluated, held_unless
+from linkax.model.names import optional_name
 from linkax.model.numbers import Number, listed, positive, zero_or_more
 from linkax.spatial.vectors import dot, length
 from linkax.xla.arrays import Array, Scalar
@@ -136,6 +138,7 @@ class ElasticRope(AbstractForce):
     damping.
     """
 
+    name: str | None = eqx.field(static=True)
     points: Points
     stiffness: Scalar
     free_length: Scalar

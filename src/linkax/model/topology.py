@@ -1,7 +1,7 @@
 """The plan of a mechanism: its tree, its loops, and where coordinates and rows lie. Names and indices only."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 
@@ -9,19 +9,10 @@ import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
+from linkax.model.names import find
 from linkax.model.terms import Term
 
 GROUND_INDEX = -1
-
-
-def find(name: Any, names: Sequence[str], what: str) -> int:
-    """Find the index of a name among those of bodies, joints or others.
-
-    **Raises:** `ValueError` that lists the known names.
-    """
-    if not isinstance(name, str) or name not in names:
-        raise ValueError(f"unknown {what} {name!r}; known: {', '.join(map(repr, names)) or 'none'}")
-    return names.index(name)
 
 
 class JointGroup(NamedTuple):
@@ -75,23 +66,29 @@ class Topology:
     constraint_terms: tuple[tuple[Term, ...], ...] = ()
     constraint_bodies: tuple[tuple[int, ...], ...] = ()
 
+    @cached_property
+    def _hash(self):
+        return hash(tuple(self.__getstate__().values()))
+
+    # Each program that is handed a state asks for it.
+    def __hash__(self) -> int:
+        return self._hash
+
+    # What is cached, hashes of strings among it, belongs to one process.
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
     @property
     def num_bodies(self) -> int:
         """n_b."""
         return len(self.bodies)
 
     def body_index(self, name: str) -> int:
-        """Find the index of a body, or of ground.
-
-        **Raises:** `ValueError` for an unknown name.
-        """
+        """Find the index of a body, or of ground. **Raises:** `ValueError` for an unknown name."""
         return GROUND_INDEX if name == GROUND_NAME else find(name, self.bodies, "body")
 
     def joint_index(self, name: str) -> int:
-        """Find the index of a joint, in the tree or cut.
-
-        **Raises:** `ValueError` for an unknown name.
-        """
+        """Find the index of a joint, in the tree or cut. **Raises:** `ValueError` for an unknown name."""
         return find(name, self.joints, "joint")
 
     @cached_property

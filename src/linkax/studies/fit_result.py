@@ -8,7 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from linkax.tables import Rows, Table, count, known, numbers, printed_as
 
+
+def _table(fit: "Fit") -> Table:
+    title = f"Fit: {fit.ended} after {count(fit.steps, 'step')}, loss {numbers(fit.loss)}"
+    title += "" if fit.noise is None else f", noise {numbers(fit.noise)}"
+    values = np.concatenate([np.ravel(known(leaf)) for leaf in jax.tree.leaves(fit.params)])
+    spreads = [None] * len(values) if fit.covariance is None else np.sqrt(np.diagonal(np.asarray(fit.covariance)))
+    rows = [
+        (name, numbers(value), "" if spread is None else numbers(spread), *_undetermined(fit, name))
+        for name, value, spread in zip(fit.names, values, spreads, strict=True)
+    ]
+    return Table(title, [Rows(("parameter", "value", "standard error", ""), rows, "parameters")])
+
+
+def _undetermined(fit, name):
+    return ["not determined by the data" if name in fit.undetermined else ""]
+
+
+@printed_as(_table)
 class Fit(NamedTuple):
     """The parameters of a fit, their covariance, and how the fit ended.
 

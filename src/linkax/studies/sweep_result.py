@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from linkax.simulation.integrate.results import ENDED_WELL, KNOWN_RESULTS, REMARKS, RESULTS
+from linkax.tables import Rows, Table, count, numbers, printed_as
 from linkax.xla.enumerations import code
 
 REASONS = (*KNOWN_RESULTS, "failed", "not_finite_output", "not_run")
@@ -19,6 +20,23 @@ EXPLANATIONS = {
 }
 
 
+def _table(sweep: "Sweep") -> Table:
+    title = f"Sweep of {count(len(sweep.reasons), 'member')}: {int(np.sum(sweep.ok))} ended well"
+    facts = [("ended", ", ".join(f"{times} {name}" for name, times in sweep.count().items()))]
+    for what, members in (("failed", sweep.failed), ("with a remark", sweep.remarked)):
+        for member, told in list(members.items())[:1]:
+            facts.append((what, f"{len(members)}, the first of them {member}: {told}"))
+    facts.append(("time of a member", numbers(sweep.seconds_per_member, "s")))
+    leaves = jax.tree_util.tree_leaves_with_path(sweep.output)
+    rows = [(f"output{jax.tree_util.keystr(path)}", _shape(leaf), numbers(leaf, axes=0)) for path, leaf in leaves]
+    return Table(title, [Rows((), facts), Rows(("", "shape", "range"), rows, "outputs")])
+
+
+def _shape(leaf):
+    return " × ".join(map(str, np.shape(leaf)))
+
+
+@printed_as(_table)
 class Sweep(NamedTuple):
     """Outputs of a function for the n members of a batch, and how each member ended.
 

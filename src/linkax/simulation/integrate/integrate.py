@@ -211,4 +211,4 @@ def _closed(flat, formulation, accuracy, initial, times, values, saves, firsts) 
     closed = map_saved_times(problem.close, *rows)
     each = lambda rows: rows[1:] if firsts is None else rows[1:][firsts]
     later = lambda rows: jnp.where(saved[:, None], each(rows), jnp.inf)
-    return State(closed.q[0], closed.v[0]), State(later(closed.q), later(closed.v))
+    return jax.tree.map(lambda rows: rows[0], closed), jax.tree.map(later, closed)

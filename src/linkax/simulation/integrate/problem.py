@@ -88,7 +88,7 @@ class Problem(eqx.Module):
 
     def close(self, t: Float[Array, ""], y: Float[Array, " n"]) -> State:
         """The `State` on the manifold to rounding."""
-        return State(*self.method.close(self.system, t, *self.unpacked(y)))
+        return State(*self.method.close(self.system, t, *self.unpacked(y)), self.system.topology)
 
 
 def derivative(t: Any, y: Float[Array, " n"], problem: Problem) -> Float[Array, " n"]:

@@ -14,8 +14,8 @@ from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.model.beams import Beam
 from linkax.model.elements import AbstractElement
 from linkax.model.joints.distance import Distance
+from linkax.model.names import find
 from linkax.model.numbers import Number, Vector, number, one_of, real
-from linkax.model.topology import find
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
 from linkax.simulation.read.reading import read, read_in_motion
@@ -92,7 +92,7 @@ def reaction_of(function: Callable[..., Any], solution: Solution, name: str, on:
     return Reaction(force[..., index, :], moment[..., index, :])
 
 
-def force_of(solution: Solution, element: str | AbstractElement) -> Float[Array, "..."]:
+def force_of(solution: Solution, element: str | AbstractElement | Distance) -> Float[Array, "..."]:
     """Read the strength of a force element, or the force of a constraint or a `Distance`.
 
     **Raises:** `ValueError` for an unknown element, and for one that has no one force.
@@ -105,7 +105,7 @@ def force_of(solution: Solution, element: str | AbstractElement) -> Float[Array,
     return of_constraint(Observables.constraint_forces, solution, solution.mechanism.topology.constraints[index])
 
 
-def length_of(solution: Solution, element: str | AbstractElement) -> Float[Array, "*batch n_t"]:
+def length_of(solution: Solution, element: str | AbstractElement | Distance) -> Float[Array, "*batch n_t"]:
     """Read the length of a force element, a constraint or a `Distance`.
 
     **Raises:** `ValueError` for an unknown element, and for one without length.
@@ -118,9 +118,9 @@ def _place(solution, element):
     mechanism = solution.mechanism
     forces, constraints, joints = mechanism.force_names, mechanism.topology.constraints, mechanism.topology.joints
     rods = [joint.name for joint in mechanism.joints if isinstance(joint, Distance)]
-    name = element
-    if isinstance(element, AbstractElement | Distance):
-        name = getattr(element, "name", None) or element.display_name
+    name: Any = element
+    if not isinstance(element, str):
+        name = getattr(element, "name", None) or getattr(element, "display_name", element)
         if f"{name} (2)" in forces:
             raise ValueError(f"there are several elements {name!r}; give each a name: Spring(..., name='strut')")
     find(name, (*forces, *constraints, *rods), "force, constraint or Distance")

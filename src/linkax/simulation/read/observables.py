@@ -21,13 +21,16 @@ from linkax.linalg.least_multipliers import LeastMultipliers, least_multipliers
 from linkax.model.beams import Beam
 from linkax.model.mechanism import Mechanism
 from linkax.model.poses import Pose
+from linkax.simulation.read.summary import of_power, of_violation
 from linkax.spatial.rotations import rotate
 from linkax.spatial.vectors import cross, dot, largest, length
+from linkax.tables import printed_as
 from linkax.xla.arrays import Array, Scalar
 
 UNCHANGED = 1e-6  # by a self-stress of magnitude one
 
 
+@printed_as(of_violation)
 class Violation(NamedTuple):
     """Largest violation of the loop rows, at each time or over the run.
 
@@ -40,6 +43,7 @@ class Violation(NamedTuple):
     acceleration: Float[Array, "..."]
 
 
+@printed_as(of_power)
 class Power(NamedTuple):
     """The rate of kinetic plus potential energy, by its causes [W].
 

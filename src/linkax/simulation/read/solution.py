@@ -14,6 +14,7 @@ from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.beams import Beam
 from linkax.model.elements import AbstractElement
+from linkax.model.joints.distance import Distance
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, number, require
 from linkax.model.poses import Pose
@@ -38,9 +39,11 @@ from linkax.simulation.read.by_name import (
 from linkax.simulation.read.observables import Observables, Power, Violation
 from linkax.simulation.read.passages import Passages, passages
 from linkax.simulation.read.reading import evaluate_dense, kept, read, read_in_motion
+from linkax.simulation.read.summary import summary
 from linkax.simulation.read.work import work
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
+from linkax.tables import printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete, jit_inline
@@ -51,6 +54,7 @@ else:
     View = Any  # of a higher layer
 
 
+@printed_as(summary)
 class Solution(eqx.Module):
     """A motion at the times `ts` [s].
 
@@ -285,7 +289,7 @@ class Solution(eqx.Module):
         change = self.energy()
         return change - change[..., :1] - sum(self.work().values(), jnp.zeros_like(change))
 
-    def force(self, element: str | AbstractElement) -> Float[Array, "..."]:
+    def force(self, element: str | AbstractElement | Distance) -> Float[Array, "..."]:
         """Force of one element, (n_t,).
 
         The pull [N] of a `Spring`, `Damper`, `ElasticRope`, `Rope` or `Distance`, negative where it pushes; the force
@@ -299,7 +303,7 @@ class Solution(eqx.Module):
         """
         return force_of(self, element)
 
-    def length(self, element: str | AbstractElement) -> Float[Array, "*batch n_t"]:
+    def length(self, element: str | AbstractElement | Distance) -> Float[Array, "*batch n_t"]:
         """Length of a `Spring`, `Damper`, `ElasticRope`, `Rope` or `Distance` [m]; see `force`."""
         return length_of(self, element)
 

@@ -78,7 +78,7 @@ def _interpolated(topology: Topology, ts, q, v, acceleration):
 
     for _ in range(ts.ndim - 1):
         of_member = jax.vmap(of_member)
-    return of_member(ts, q, v, acceleration)
+    return of_member(*(ts, q, v, acceleration))
 
 
 @jit_inline

@@ -194,7 +194,8 @@ class _Remainder(eqx.Module):
 @jit_inline
 def _marked(mechanism, state, remainder):
     """The state, with infinite speeds where it is none."""
-    return State(state.q, jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf))
+    v = jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf)
+    return State(state.q, v, mechanism.topology)
 
 
 def _assembled(*given):
@@ -236,7 +237,7 @@ def _assemble(flat, positions, speeds, guess, t, *, branches):
             for beam in beams_of(demand.system)
         },
     )
-    return State(q, found.v), remainder
+    return State(q, found.v, system.topology), remainder
 
 
 @jit_inline
@@ -245,7 +246,8 @@ def _assembled_again(given, q, branches):
     flat, positions, speeds, guess, t = given
     demand, begin = demand_of(flat, positions, guess, t)
     q = close_loops(demand, begin, q)
-    return State(q, speeds_again(configure(demand.system, t, q), speeds, branches))
+    v = speeds_again(configure(demand.system, t, q), speeds, branches)
+    return State(q, v, demand.system.topology)
 
 
 def demand_of(flat: Any, positions: JointValues, guess: JointValues, t: Array) -> tuple[LoopClosure, Array]:

@@ -66,7 +66,7 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
     leaves; it lies on a branch only if no force of the loops turns it.
     """
     q, v = method.close(system, t, state.q, state.v)
-    start, begins = State(q, v), lax.stop_gradient(t)
+    start, begins = State(q, v, system.topology), lax.stop_gradient(t)
     # All that follows only decides, and has no derivative.
     method, system, t, given, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, state.q, q, v))
     # A singular mass matrix has spoiled them.

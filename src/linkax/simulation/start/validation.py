@@ -116,7 +116,7 @@ def checked_state(mechanism: Mechanism, state: State) -> State:
             require(entries[taken], is_finite, of_joint, "it must be finite")
             if kind.has_quaternion and what == "q":
                 _check_quaternion(entries[taken], of_joint)
-    return State(*found)
+    return State(found[0], found[1], topology)
 
 
 def _check_quaternion(coordinates, what):
