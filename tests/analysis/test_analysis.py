@@ -13,6 +13,7 @@ from linkax.scenes import SCENES
 def test_mobility_of_a_bricard_names_its_redundant_rows():
     found = lx.mobility(*start("bricard"))
     assert (found.rank, found.degrees_of_freedom, found.num_redundant) == (4, 1, 1)
+    assert (found.spatial_count, found.planar_count) == (0, None)
     # Any one of the five may be left out, but not two.
     assert found.redundant == {"P4": ("α₂", "α₃", "s₁", "s₂", "s₃")}
 
@@ -21,6 +22,7 @@ def test_mobility_in_and_beside_a_singular_configuration():
     mechanism, state = start("spatial-four-link", "FL2")
     found = lx.mobility(mechanism, state)
     assert (found.rank, found.degrees_of_freedom, found.num_redundant) == (1, 2, 4)
+    assert (found.spatial_count, found.planar_count) == (-2, 1)
     beside = lx.mobility(mechanism, lx.State(state.q + 0.1 * np.array([1.0, 1.0, -1.0]), state.v))
     assert (beside.rank, beside.degrees_of_freedom, beside.num_redundant) == (2, 1, 3)
     assert 0.01 < beside.distance < 0.2

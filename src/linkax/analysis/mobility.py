@@ -10,6 +10,7 @@ from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.least_multipliers import least_multipliers
 from linkax.linalg.saddle_inverse import singularity_distance
+from linkax.model.immobile_rows import is_planar
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import require_type
 from linkax.model.topology import Topology
@@ -18,6 +19,7 @@ from linkax.simulation.integrate.options import check_accuracy
 from linkax.simulation.integrate.run import DEFAULT_FORMULATION, checked_formulation
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import Program
 
@@ -27,6 +29,29 @@ ROTATIONS = {(1, 2): "α₁", (2, 1): "α₁", (0, 2): "α₂", (0, 1): "α₃"}
 TRANSLATIONS = ("s₁", "s₂", "s₃")
 
 
+def _table(found: "Mobility") -> Table:
+    topology, equations = found.topology, found.joint_equations
+    known_ones = known(found.dispensable) is not None
+    redundant = {name: ", ".join(rows) for name, rows in found.redundant.items()} if known_ones else {}
+    total = topology.num_rows + topology.num_immobile_rows
+    freedoms = numbers(found.degrees_of_freedom)
+    title = f"Mobility: {freedoms} degree{'' if freedoms == '1' else 's'} of freedom"
+    counts = [f"{found.spatial_count} in space"]
+    counts += [] if found.planar_count is None else [f"{found.planar_count} in the plane"]
+    facts = [
+        ("Grübler–Kutzbach", ", ".join(counts)),
+        ("joint equations", f"{sum(equations.values())} on {count(topology.num_bodies, 'body')}"),
+        ("loop equations", f"{total}, of rank {numbers(found.rank)}"),
+        ("redundant", numbers(found.num_redundant)),
+        ("distance", f"{numbers(found.distance)} from a singular configuration (1 is far)"),
+    ]
+    names = [*redundant, *(name for name in equations if name not in redundant)]
+    rows = [(name, str(equations[name]), redundant.get(name, "")) for name in names]
+    head = ("joint", "equations", "of which one may be left out")
+    return Table(title + batch(found.rank.shape), [Rows((), facts), Rows(head, rows, "joints")])
+
+
+@printed_as(_table)
 class Mobility(eqx.Module):
     """How a mechanism can move at a state.
 
@@ -35,6 +60,7 @@ class Mobility(eqx.Module):
     - `num_redundant`: number of rows that depend on others, including rows that no motion changes.
     - `distance`: from the nearest singular configuration, see `linkax.Accuracy`. Exactly in one, the smaller `rank`
       shows it, and not this number. NaN where a number that JAX traces is not one that it can be.
+    - `is_planar`: whether all joints turn about one direction, and slide across it.
     - `dispensable`: whether each constraint row, in the order of `rows`, could be left out without freeing a motion,
       (m,).
     """
@@ -44,7 +70,33 @@ class Mobility(eqx.Module):
     num_redundant: Int[Array, ""]
     distance: Float[Array, ""]
     dispensable: Bool[Array, " m"]
-    topology: Topology = eqx.field(static=True)
+    topology: Topology = eqx.field(static=True, repr=False)
+    is_planar: bool = eqx.field(static=True, default=False)
+
+    @property
+    def joint_equations(self) -> dict[str, int]:
+        """{joint or constraint: how many of the six freedoms between two bodies it takes}; of beams none."""
+        return joint_equations(self.topology)
+
+    @property
+    def spatial_count(self) -> int:
+        """Degrees of freedom by the Grübler–Kutzbach criterion in space: 6 for each body, less all joint equations.
+
+        It is `degrees_of_freedom` − `num_redundant`; of beams it counts the strains in place of bodies.
+        """
+        topology = self.topology
+        return topology.num_speeds - topology.num_rows - topology.num_immobile_rows
+
+    @property
+    def planar_count(self) -> int | None:
+        """The same in the plane, 3 for each body, less joint equations in it; None for a mechanism that is not planar.
+
+        Planar is one whose joints all turn about one direction, and slide across it.
+        """
+        if not self.is_planar:
+            return None
+        planar = [name for name in self.joint_equations if name in _locking(self.topology)]
+        return self.spatial_count - 3 * self.topology.num_bodies + 3 * len(planar)
 
     @property
     def rows(self) -> tuple[tuple[str, str], ...]:
@@ -53,12 +105,30 @@ class Mobility(eqx.Module):
 
     @property
     def redundant(self) -> dict[str, tuple[str, ...]]:
-        """{cut joint or constraint: its rows that could be left out, one at a time}."""
+        """{cut joint or constraint: its rows that could be left out, one at a time}; of a batch, in any member."""
         redundant = {}
-        for (name, row), dispensable in zip(self.rows, np.asarray(self.dispensable), strict=True):
+        of_members = np.atleast_2d(np.asarray(self.dispensable))
+        of_any = np.any(of_members, axis=tuple(range(of_members.ndim - 1))).tolist()
+        for (name, row), dispensable in zip(self.rows, of_any, strict=True):
             if dispensable:
                 redundant[name] = (*redundant.get(name, ()), row)
         return redundant
+
+
+def joint_equations(topology: Topology) -> dict[str, int]:
+    """How many equations each joint and constraint has; of joints that are parts of beams none."""
+    found = {}
+    for name, kind in zip(topology.joints, topology.joint_types, strict=True):
+        if isinstance(kind, type):
+            plain = len(kind.locked_rotations) + len(kind.locked_translations)
+            found[name] = plain + bool(kind.combined_rotations or kind.combined_translations)
+    return found | dict.fromkeys(topology.constraints, 1)
+
+
+def _locking(topology: Topology) -> list[str]:
+    """Joints of a planar mechanism that keep a body in the plane: all but rods between points."""
+    kinds = zip(topology.joints, topology.joint_types, strict=True)
+    return [name for name, kind in kinds if isinstance(kind, type) and kind.locked_rotations]
 
 
 def row_names(topology: Topology) -> tuple[tuple[str, str], ...]:
@@ -120,4 +190,5 @@ def _mobility(mechanism, state, t, tangent_space):
         distance=singularity_distance(None, rows, system.scales, tolerance, system.structure.islands),
         dispensable=jnp.concatenate([dispensable, jnp.ones(topology.num_immobile_rows, bool)]),
         topology=topology,
+        is_planar=is_planar(mechanism),
     )
