@@ -17,9 +17,10 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import largest
 from linkax.spatial.vectors import length as length_of
-from linkax.straight_line.known import KnownEntries, KnowsEntries
+from linkax.straight_line.known import KnowsEntries, flat_with_known
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import positive_or_one
+from linkax.xla.flat import Flat
 
 
 class System(KnowsEntries):
@@ -78,21 +79,18 @@ class System(KnowsEntries):
         return largest(v / self.scales)
 
 
-def system_of(
-    mechanism: Mechanism, dtype: DTypeLike, fixed_scales: bool = True, known: KnownEntries | None = None
-) -> System:
+def system_of(mechanism: Mechanism | Flat[Mechanism], dtype: DTypeLike, fixed_scales: bool = True) -> System:
     """Stack the numbers of a mechanism in a floating-point type.
 
-    **Arguments:**
+    A program knows entries of these numbers as a `flat_with_known` mechanism has noted them, or else where they are not
+    traced.
 
-    - `fixed_scales`: lengths that serve as scales have no derivative, since no motion depends on them; what is told in
-      them does, such as the distance from a singular configuration.
-    - `known`: which entries of the mechanism's arrays a program may know; by default those of arrays that are not
-      traced.
+    **Arguments:** `fixed_scales`: lengths that serve as scales have no derivative, since no motion depends on them;
+    what is told in them does, such as the distance from a singular configuration.
     """
-    known = KnownEntries.of(mechanism) if known is None else known
-    known = known.through(_stacked, mechanism, np.dtype(dtype), fixed_scales)
-    return dataclasses.replace(_stacked(mechanism, dtype, fixed_scales), known=known)
+    flat = mechanism if isinstance(mechanism, Flat) else flat_with_known(mechanism)
+    known = flat.noted.through(_stacked, flat.tree, np.dtype(dtype), fixed_scales)
+    return dataclasses.replace(_stacked(flat.tree, dtype, fixed_scales), known=known)
 
 
 def _stacked(mechanism, dtype, fixed_scales) -> System:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from linkax.spatial.rotations import COORDINATE_AXES
 from linkax.straight_line.known import known_values, remember
-from linkax.xla.arrays import Array, Scalar
+from linkax.xla.arrays import Array, Scalar, can_change
 from linkax.xla.tracing import concrete, without_derivatives
 
 # What a user may give for a number, for several, for a matrix, and for a direction (by name, as "-x").
@@ -98,7 +98,6 @@ def _unchanging(entry: Any, dtype: np.dtype) -> np.ndarray:
 
 def read_only(tree: Tree) -> Tree:
     """Replace NumPy arrays that can be written to by copies that cannot."""
-    can_change = lambda leaf: isinstance(leaf, np.ndarray) and leaf.flags.writeable
     return jax.tree.map(lambda leaf: _unchanging(leaf, leaf.dtype) if can_change(leaf) else leaf, tree)
 
 

@@ -1,7 +1,7 @@
 """The plan of a mechanism: its tree, its loops, and where coordinates and rows lie. Names and indices only."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 

@@ -188,7 +188,7 @@ def spans(mechanism: Mechanism) -> list[Span]:
         if isinstance(rope, Rope):
             found.append(Span("rod" if len(rope.points) == 2 else "rope", f"{rope.name}: Rope", rope.points))
     for name, force in zip(mechanism.force_names, mechanism.forces, strict=True):
-        label = f"{name}: {type(force).__name__}" if force.name else name
+        label = f"{name}: {type(force).__name__}" if getattr(force, "name", None) else name
         if isinstance(force, Spring | Damper):
             found.append(Span("spring" if isinstance(force, Spring) else "damper", label, (force.first, force.second)))
         if isinstance(force, ElasticRope):

@@ -70,7 +70,7 @@ def _closing(run, initial, integrated):
 
 @Program
 def _check_start(flat, state, t0, tangent_space) -> InitialCheck:
-    system = system_of(flat.tree, state.q.dtype, known=flat.noted)
+    system = system_of(flat, state.q.dtype)
     return check_initial_state(tangent_space.prepared(system.dtype), system, t0, state)
 
 
@@ -83,7 +83,7 @@ def problem_of(
     """The initial value problem's right-hand side from a state that was checked."""
     dtype = initial.state.q.dtype
     start = initial.can_start, initial.t, initial.singular
-    system = system_of(flat.tree, dtype, known=flat.noted)
+    system = system_of(flat, dtype)
     return Problem(flat.tree, system, formulation.prepared(dtype, initial.rank), accuracy, *start)
 
 

@@ -1,6 +1,5 @@
 """Reading a solution: functions of `Observables` over all its times and members, each kept while the solution lives."""
 
-import weakref
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -8,6 +7,7 @@ from typing import Any, NamedTuple
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from linkax.equations.system import system_of
@@ -23,6 +23,7 @@ from linkax.simulation.start.state import State
 from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.flat import Flat
+from linkax.xla.kept import kept_while_alive
 from linkax.xla.tracing import Program, all_concrete, blank_result, is_first
 from linkax.xla.waiting import compiling
 
@@ -75,27 +76,27 @@ class SavedMotion(NamedTuple):
     v: Float[Array, "*batch n_t n_v"]
 
 
-_of_solutions = {}  # what has been read from solutions that are alive, by their identity
-
-
 def kept(solution: Solution, key: Hashable, compute: Callable[[], Any]) -> Any:
     """What `compute` gives, once for a run, while its solution lives: other names and readings ask for the same."""
-    if solution.ts.ndim > 1 or not all_concrete(solution):
+    if solution.ts.ndim > 1:
         return compute()
-    if id(solution) not in _of_solutions:
-        _of_solutions[id(solution)] = {}
-        weakref.finalize(solution, _of_solutions.pop, id(solution))
-    found = _of_solutions[id(solution)]
+    found = _found(solution)
     if key not in found:
         found[key] = compute()
     return found[key]
+
+
+@kept_while_alive(if_all=lambda leaf: not isinstance(leaf, Tracer))
+def _found(solution):
+    """What has been read of a solution; of one that is traced, nothing."""
+    return {}
 
 
 @Program
 def _of_times(function, motion: SavedMotion, dynamics, details):
     def of_member(motion, dynamics, details):
         dtype = motion.q.dtype
-        system = system_of(motion.flat.tree, dtype, fixed_scales=False, known=motion.flat.noted)
+        system = system_of(motion.flat, dtype, fixed_scales=False)
         tangent_space = motion.tangent_space.prepared(dtype, motion.rank_nearby)
         method = motion.formulation.prepared(dtype, motion.rank_nearby)
 
@@ -122,5 +123,5 @@ def evaluate_dense(
     dtype = interpolation.t0.dtype
     t = jnp.asarray(t, dtype)
     y = interpolation.evaluate(t)
-    system, method = system_of(flat.tree, dtype, known=flat.noted), formulation.prepared(dtype, rank_nearby)
+    system, method = system_of(flat, dtype), formulation.prepared(dtype, rank_nearby)
     return Problem(flat.tree, system, method, accuracy).close(t, y)

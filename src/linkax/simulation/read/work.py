@@ -47,7 +47,8 @@ def _between(solution):
 def _interpolated(topology: Topology, ts, q, v, acceleration):
     """Times, coordinates and speeds between times that differ, by polynomials of degree five; inf elsewhere."""
 
-    def between(t, q, v, acceleration, later):
+    def between(now, later):
+        t, q, v, acceleration = now
         rate = lambda q, v: rates(topology, q, v)
         curve = lambda q, v, acceleration: jax.jvp(rate, (q, v), (rate(q, v), acceleration))
         (end, q1, *ends) = later
@@ -73,7 +74,7 @@ def _interpolated(topology: Topology, ts, q, v, acceleration):
 
     def of_member(*states):
         first, last = ([part[ends] for part in states] for ends in (slice(None, -1), slice(1, None)))
-        found = jax.vmap(between)(*first, last)
+        found = jax.vmap(between)(first, last)
         return [part.reshape(-1, *part.shape[2:]) for part in found]
 
     for _ in range(ts.ndim - 1):

@@ -252,7 +252,7 @@ def _assembled_again(given, q, branches):
 
 def demand_of(flat: Any, positions: JointValues, guess: JointValues, t: Array) -> tuple[LoopClosure, Array]:
     """The problem of closing the loops, and the coordinates where the search begins."""
-    system = system_of(flat.tree, jnp.result_type(float), known=flat.noted)
+    system = system_of(flat, jnp.result_type(float))
     topology = system.topology
     q = jnp.asarray(neutral(topology, system.dtype))
     for given in (guess, positions):
