@@ -33,6 +33,11 @@ forces = [
 ]
 mechanism = lx.Mechanism([arm, box, point], joints, forces, [lx.Drive("motor", "hinge", lambda t: 2.0 * t)])
 state = lx.assemble(mechanism, {"hinge": 0.3}, {("ball", 1): 0.0}, guess={"slide": 1})
+rough = {"hinge": 0.3, "box": lx.Pose([1.0, 0.0, 0.0]), "arm.tip": [1.0, 0.1, 0.0]}
+state = lx.assemble(mechanism, {"box": lx.Pose([1.0, 0, 0])}, {"arm": lx.Velocity(angular=[0, 0, 1])}, guess=rough)
+bar = lx.rod_between("bar", [0.0, 0.0, 1.0], np.zeros(3), mass=1, thickness=0.1)
+plate = lx.RigidBody("plate", 1.0, inertia=0.2).placed([0.0, 1.0, 0.0]).at_world([0.0, 1.5, 0.0])
+state = lx.assemblies(mechanism, {"hinge": 0.3}, tries=10)[0]
 formulation = lx.TangentSpace(metric="identity")
 solution = lx.simulate(mechanism, state, t1=2, accuracy=lx.Accuracy(1e-6), formulation=formulation)
 print(solution.position("arm", at="tip")[-1], solution.reaction("hinge").force, lx.mobility(mechanism, state).rank)

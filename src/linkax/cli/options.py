@@ -73,9 +73,18 @@ class RunOptions:
         }
 
     def initial(self, mechanism: lx.Mechanism) -> lx.State:
-        """Assemble the initial state."""
+        """Assemble the initial state.
+
+        **Raises:** `AssemblyError` with what can be done from the command line.
+        """
         progress("assembling", None)
-        return self.scene.initial(mechanism, self.parameters)
+        try:
+            return self.scene.initial(mechanism, self.parameters)
+        except lx.AssemblyError as error:
+            what, _, _ = str(error).rpartition("; ")
+            given = ", ".join(f"{name}={self.parameters[name]:g}" for name in self.scene.parameters)
+            remedy = f"change some of the parameters of scene {self.scene.name!r} by --set NAME=VALUE: {given}"
+            raise lx.AssemblyError(f"{what}; {remedy}") from error
 
 
 def output_folder(asked: Path | None, prefix: str, settings: dict[str, Any], files: Iterable[str]) -> Path:

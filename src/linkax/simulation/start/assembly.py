@@ -19,6 +19,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number
 from linkax.simulation.start.branch_speeds import other_speeds, smallest_speeds, speeds_again, speeds_on_branch
 from linkax.simulation.start.closing import CLOSED, LoopClosure, close_loops
+from linkax.simulation.start.doubts import doubts
 from linkax.simulation.start.initial_state import ON_BRANCH, moving_joints
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import beams_of, rank_tolerance
@@ -40,13 +41,15 @@ from linkax.xla.static_scatter import scatter_static
 from linkax.xla.tracing import Program, all_concrete, is_first, jit_inline, without_derivatives
 from linkax.xla.waiting import compiling
 
+GUESS = "give another guess, such as guess={body: lx.Pose(position)} with its rough place"
+
 
 class AssemblyError(ValueError):
     """No positions close the loops of a mechanism with those asked for."""
 
 
 class AssemblyWarning(UserWarning):
-    """The loops of a mechanism close only where beams are strained, or leave open on which branch it moves."""
+    """The loops of a mechanism close only where beams are strained, leave open how it moves, or in an odd way."""
 
 
 def assemble(
@@ -89,8 +92,10 @@ def assemble(
     cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
     raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
-    Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain, and of speeds that
-    fit several branches.
+    Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain; of speeds that fit several
+    branches; of angles beyond a whole turn, which may be degrees, but of joints whose turns a force or a constraint
+    counts; where no guess is given, of slides between moving bodies with lengths of both signs; and of a body between
+    two balls whose spin nothing decides. `linkax.assemblies` finds what other assemblies there are.
     """
     check_mechanism(mechanism)
     t = checked_time(t, "t")
@@ -111,11 +116,13 @@ def assemble(
         if strain > remainder.most:
             warnings.warn(
                 f"beam {beam!r} is strained, with an energy of {energy:.3g} J, as the loops do not close otherwise; "
-                "check lengths and offsets, hold fewer positions, or give another guess; linkax.equilibrium finds the "
-                "strains at rest",
+                f"check lengths and offsets, hold fewer positions, or {GUESS}; linkax.equilibrium finds the strains at "
+                "rest",
                 AssemblyWarning,
                 stacklevel=2,
             )
+    for doubt in doubts(mechanism, held, begin, moving, state):
+        warnings.warn(doubt, AssemblyWarning, stacklevel=2)
     if remainder.undecided and (names := _open_speeds(mechanism, measured, moving, t, state)):
         warnings.warn(
             f"the configuration is singular, and the speeds asked fit several branches of the motion, which differ in "
@@ -138,7 +145,7 @@ def _raise_if_open(mechanism, state, t, remainder):
     topology = mechanism.topology
     held = ", ".join(dict.fromkeys(repr(along.joint) for along, _ in remainder.positions.by_term())) or "none"
     remains = lambda size, unit: f"a gap of {size:.6g} {unit} remains (positions held: {held})"
-    advice = "check lengths and offsets, hold fewer positions, or give another guess"
+    advice = f"check lengths and offsets, hold fewer positions, or {GUESS}"
     gap, scaled = remainder.gap, remainder.gap_in_scales
     for cut, name in enumerate(topology.joints[topology.num_bodies :]):
         for size, in_scales, unit in ((gap.distance, scaled.distance, "m"), (gap.angle, scaled.angle, "rad")):

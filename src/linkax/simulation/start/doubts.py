@@ -1,0 +1,79 @@
+"""What is odd of a state that was assembled, and of what was given for it."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from linkax.model.bodies import GROUND_NAME
+from linkax.model.joints.prismatic import Prismatic
+from linkax.model.mechanism import Mechanism
+from linkax.simulation.start.joint_values import JointValues
+from linkax.simulation.start.places import SUFFIX
+from linkax.simulation.start.state import State
+
+TURN = 2.0 * np.pi
+
+
+def doubts(
+    mechanism: Mechanism, positions: JointValues, guess: JointValues, speeds: JointValues, state: State
+) -> Iterator[str]:
+    """Tell of angles that may be degrees, lengths of struts of both signs, and spins that nothing decides."""
+    yield from _many_turns(mechanism, positions, "position")
+    yield from _many_turns(mechanism, guess, "guess")
+    if not guess.groups:
+        yield from _short_struts(mechanism, positions, state)
+    yield from _idle_spins(mechanism, speeds, state)
+
+
+def _many_turns(mechanism, values, what) -> Iterator[str]:
+    """Of joints whose turns nothing counts."""
+    elements = (*mechanism.forces, *mechanism.constraints)
+    counted = {name for element in elements for name in element.joints}
+    for alike, rows in zip(values.groups, values.values, strict=True):
+        if alike.kind.has_quaternion or alike.kind.is_screw:
+            continue
+        units = alike.kind.speed_units if alike.index is None else (alike.kind.speed_units[alike.index],)
+        for along, numbers in zip(alike.terms, np.asarray(rows), strict=True):
+            for unit, angle in zip(units, numbers, strict=True):
+                if unit == "rad" and abs(angle) > TURN and along.joint not in counted:
+                    yield (
+                        f"{what} of joint {along.joint!r} is {angle:.6g} rad, which is {abs(angle) / TURN:.3g} turns; "
+                        f"if degrees are meant, give numpy.deg2rad({angle:.6g}), else an angle within one turn"
+                    )
+
+
+def _short_struts(mechanism, positions, state) -> Iterator[str]:
+    """Of slides between moving bodies that nothing holds, with frames from which lengths can count."""
+    topology, held = mechanism.topology, {along.joint for along, _ in positions.by_term()}
+    lengths = {}
+    for joint in mechanism.joints[: topology.num_bodies]:
+        ends = joint.parent.body, joint.child.body
+        if not isinstance(joint, Prismatic) or GROUND_NAME in ends or joint.name in held:
+            continue
+        if all(mechanism.body(end).drawn_at is None for end in ends):
+            lengths[joint.name] = float(state.q[topology.coordinates[joint.name]][0])
+    if len({*np.sign([*lengths.values()])} - {0.0}) == 2:
+        short = ", ".join(f"{name!r} ({length:.3g} m)" for name, length in lengths.items() if length < 0.0)
+        yield (
+            f"slides between moving bodies have lengths below zero, {short}, and others above, and no guess was given; "
+            "if these are struts, give a guess for them, or for the place of a body: guess={body: lx.Pose(position)}"
+        )
+
+
+def _idle_spins(mechanism, speeds, state) -> Iterator[str]:
+    """Of bodies between two balls in a mechanism that moves."""
+    topology = mechanism.topology
+    asked = {along.joint.removesuffix(SUFFIX).partition(".")[0] for along, _ in speeds.by_term()}
+    asked |= {along.joint for along, _ in speeds.by_term()}
+    if not speeds.groups or not np.any(np.asarray(state.v)):
+        return
+    for body, joints in topology.spinning.items():
+        name, balls = topology.bodies[body], [topology.joints[joint] for joint in joints]
+        if asked & {name, *balls} or not np.any(np.asarray(mechanism.bodies[body].inertia)):
+            continue
+        ball = next(ball for ball in balls if mechanism.joint(ball).speed_units)
+        yield (
+            f"nothing decides how fast body {name!r} spins about the line between {' and '.join(map(repr, balls))}; it "
+            "is left to the smallest speeds of joints in the tree; to choose, ask for a speed of one of these, such as "
+            f"speeds={{({ball!r}, 0): 0.0}}"
+        )

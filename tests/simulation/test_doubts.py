@@ -1,0 +1,63 @@
+"""What `assemble` says of odd answers, and that it says nothing of others."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+import linkax as lx
+
+
+def swing(*more):
+    arm = lx.rod("arm", 1.0, 1.0)
+    return lx.Mechanism([arm], [lx.Revolute("pin", lx.GROUND, arm.at("base"), axis="z")], *more)
+
+
+def test_angles_that_may_be_degrees():
+    with pytest.warns(lx.AssemblyWarning, match=r"position of joint 'pin' is 90 rad.*deg2rad\(90\)"):
+        lx.assemble(swing(), {"pin": 90.0})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lx.assemble(swing(), {"pin": -6.2})
+        lx.assemble(swing([lx.JointSpring("pin", 2.0)]), {"pin": 90.0})  # which counts turns
+
+
+def test_struts_of_lengths_of_both_signs():
+    """Two struts between a lever and a plate, with nothing to tell which way they point."""
+    lever, plate = lx.rod("lever", 1.0, 1.0), lx.box("plate", [1.0, 0.1, 0.1], 1.0)
+    tubes = [lx.point_mass(f"tube_{i}", 0.1) for i in range(2)]
+    joints = [
+        lx.Revolute("pin", lx.GROUND, lever.at("base"), axis="z"),
+        lx.Prismatic("slide", lever.at("tip"), tubes[0], axis="x"),
+        lx.Prismatic("other", lever.at("base"), tubes[1], axis="x"),
+        lx.Fixed("weld", lx.GROUND.at([0.4, 0.0, 0.0]), plate),
+        lx.Spherical("near", tubes[0], plate, cut=True),
+        lx.Spherical("far", tubes[1], plate, cut=True),
+    ]
+    mechanism = lx.Mechanism([lever, plate, *tubes], joints)
+    with pytest.warns(lx.AssemblyWarning, match=r"below zero, 'slide' \(-0\.6 m\)"):
+        lx.assemble(mechanism)
+
+
+def test_a_spin_that_nothing_decides():
+    """Of a coupler between two balls: asked for, it is as asked."""
+    arm, slider = lx.rod("arm", 0.5, 1.0), lx.point_mass("slider", 1.0)
+    coupler = lx.rod("coupler", 1.0, 1.0, thickness=0.1)
+    joints = [
+        lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z"),
+        lx.Spherical("near", arm.at("tip"), coupler.at("base")),
+        lx.Spherical("far", coupler.at("tip"), slider),
+        lx.Prismatic("guide", lx.GROUND.at([0.0, 0.0, 0.2]), slider, axis="x"),
+    ]
+    mechanism = lx.Mechanism([arm, coupler, slider], joints)
+    told = "nothing decides how fast body 'coupler' spins about the line between 'near' and 'far'"
+    with pytest.warns(lx.AssemblyWarning, match=told) as warned:
+        found = lx.assemble(mechanism, {"hinge": 1.0}, {"hinge": 2.0})
+    (advice,) = re.findall(r"speeds=(\{.*\})", str(warned[0].message))
+    turning = lx.Solution.of_state(mechanism, found).angular_velocity("coupler")[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lx.assemble(mechanism, {"hinge": 1.0}, {"hinge": 2.0} | eval(advice))
+        again = lx.assemble(mechanism, {"hinge": 1.0}, {"coupler": lx.Velocity(angular=turning)})
+    np.testing.assert_allclose(again.v, found.v, atol=1e-9)
