@@ -136,8 +136,8 @@ def _stiff(solution):
     fastest = int(np.argmax(rates))
     explicit = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
     rigid = (
-        "take a rigid joint or constraint in its place, or, where it has come to rest or the tolerance is loose, "
-        "solver=linkax.Rodas5P()"
+        "take solver=linkax.Rodas5P(), which steps over it where it has come to rest or the tolerance is loose, or a "
+        "rigid joint or constraint in its place"
     )
     advice = explicit if _is_implicit(solution) else rigid
     return (

@@ -47,11 +47,10 @@ def _between(solution):
 def _interpolated(topology: Topology, ts, q, v, acceleration):
     """Times, coordinates and speeds between times that differ, by polynomials of degree five; inf elsewhere."""
 
-    def between(now, later):
-        t, q, v, acceleration = now
+    def between(before, later):
         rate = lambda q, v: rates(topology, q, v)
         curve = lambda q, v, acceleration: jax.jvp(rate, (q, v), (rate(q, v), acceleration))
-        (end, q1, *ends) = later
+        (t, q, v, acceleration), (end, q1, *ends) = before, later
         span = end - t
         is_span = jnp.isfinite(span) & (span > 0.0)
         h = jnp.where(is_span, span, 1.0)
