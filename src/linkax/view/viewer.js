@@ -9,6 +9,8 @@ function showMechanism(contents, numbers, T) {
   const [low, high, up] = [contents.low, contents.high, contents.up].map((entries) => vector(entries));
   const extent = Math.max(...high.clone().sub(low).toArray()) || 1;
   const unit = 0.025 * extent; // size of a symbol [m]
+  const centre = low.clone().add(high).multiplyScalar(0.5);
+  const corners = [low, high].flatMap((x) => [low, high].flatMap((y) => [low, high].map((z) => new T.Vector3(x.x, y.y, z.z))));
   const INK = "#444444", PALE = "#f4f4f4";
 
   // --- The stage ---------------------------------------------------------------------------------------------------
@@ -20,7 +22,6 @@ function showMechanism(contents, numbers, T) {
   scene.background = new T.Color("#f7f8fa");
   const camera = new T.PerspectiveCamera(30, 1, 0.01 * extent, 100 * extent);
   camera.up.copy(up);
-  const centre = low.clone().add(high).multiplyScalar(0.5);
   scene.add(new T.HemisphereLight("#ffffff", "#b8bcc4", 2.2));
   const lamp = new T.DirectionalLight("#ffffff", 1.6);
   scene.add(lamp);
@@ -28,12 +29,17 @@ function showMechanism(contents, numbers, T) {
   const toward = vector(contents.camera.toward), side = vector(contents.camera.up).cross(toward);
   if (Math.abs(toward.dot(up)) < 0.01) toward.addScaledVector(up, 0.2).addScaledVector(side, 0.3); // not quite in plane
 
+  // The camera as near as all corners of the box allow.
   function home() {
     const { width, height } = stage.getBoundingClientRect();
-    const radius = 0.5 * high.distanceTo(low) + 3 * unit;
-    const wide = Math.min(1, width / height) * Math.tan(Math.PI / 12);
+    const tall = Math.tan(Math.PI / 12), wide = (tall * width) / Math.max(height, 1);
+    const back = toward.clone().normalize(), right = up.clone().cross(back).normalize(), above = back.clone().cross(right);
+    const distances = corners.map((corner) => {
+      const arm = corner.clone().sub(centre), reach = (axis) => Math.abs(arm.dot(axis)) + 3 * unit;
+      return arm.dot(back) + Math.max(reach(right) / wide, reach(above) / tall);
+    });
     controls.target.copy(centre);
-    camera.position.copy(centre).addScaledVector(toward.clone().normalize(), (1.05 * radius) / Math.sin(Math.atan(wide)));
+    camera.position.copy(centre).addScaledVector(back, Math.max(...distances));
     controls.update();
     redraw();
   }
@@ -223,17 +229,19 @@ function showMechanism(contents, numbers, T) {
 
   const floor = new T.GridHelper(2 * extent, 20, "#d5d8dd", "#e3e6ea");
   floor.quaternion.setFromUnitVectors(Y, up);
-  const depths = [low, high].flatMap((x) => [low, high].flatMap((y) => [low, high].map((z) => up.x * x.x + up.y * y.y + up.z * z.z)));
-  floor.position.copy(centre).addScaledVector(up, Math.min(...depths) - up.dot(centre) - 3 * unit);
+  const lowest = Math.min(...corners.map((corner) => corner.dot(up)));
+  floor.position.copy(centre).addScaledVector(up, lowest - up.dot(centre) - 3 * unit);
   scene.add(floor);
-  const corner = floor.position.clone().addScaledVector(camera.up.clone().cross(toward).normalize(), -extent);
+  const aside = up.clone().cross(toward).normalize();
+  const left = Math.min(...corners.map((corner) => corner.dot(aside))) - centre.dot(aside);
+  const origin = floor.position.clone().addScaledVector(aside, Math.max(left - 5 * unit, -0.6 * extent));
   ["x", "y", "z"].forEach((axis, index) => {
-    const tip = corner.clone().add(new T.Vector3().setComponent(index, 4 * unit));
-    rod(corner, tip, 0.12 * unit, ["#d43d3d", "#3a9a3a", "#3d5fd4"][index], axis, scene);
+    const tip = origin.clone().add(new T.Vector3().setComponent(index, 4 * unit));
+    rod(origin, tip, 0.12 * unit, ["#d43d3d", "#3a9a3a", "#3d5fd4"][index], axis, scene);
     name(axis, mesh(new T.SphereGeometry(0.12 * unit), INK, axis, scene)).position.copy(tip);
   });
   if (contents.gravity) {
-    const from = corner.clone().addScaledVector(up, 9 * unit), to = corner.clone().addScaledVector(up, 4.5 * unit);
+    const from = origin.clone().addScaledVector(up, 9 * unit), to = origin.clone().addScaledVector(up, 4.5 * unit);
     const label = `gravity, ${contents.gravity.toPrecision(3)} m/s²`;
     stretch(stick(0.15 * unit, INK, label, scene), from, to);
     const head = mesh(new T.ConeGeometry(0.5 * unit, 1.5 * unit, 12), INK, label, scene);
