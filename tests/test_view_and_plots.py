@@ -202,6 +202,7 @@ def test_plots_show_what_the_solution_says(crank_slider):
     joint = lx.plot.joint(solution, "guide")
     assert labels(joint) == ["coordinate\n[m]", "speed\n[m/s]"]
     np.testing.assert_array_equal(joint.axes[1].lines[0].get_ydata(), solution.joint_speed("guide"))
+    assert Image.open(io.BytesIO(joint._repr_png_())).size == (700, 500)  # which a notebook shows
     energy = lx.plot.energy(solution)
     np.testing.assert_allclose(energy.axes[0].lines[-1].get_ydata(), solution.energy())
     assert len(lx.plot.violations(solution).axes) == 3

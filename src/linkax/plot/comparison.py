@@ -1,8 +1,7 @@
 """Plot a comparison of formulations."""
 
-from matplotlib.figure import Figure
-
 from linkax.formulations.named import TANGENT_SPACE
+from linkax.plot.figure import Figure
 from linkax.scenery.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
 from linkax.studies.comparison_result import Comparison
 

@@ -6,8 +6,8 @@ cell. All raise `ValueError` for an unknown name, and for the solution of a batc
 """
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from linkax.plot.figure import Figure
 from linkax.scenery.colours import BLUE, GREEN, INK, VERMILION, body_colour
 from linkax.scenery.scenery import reached
 from linkax.simulation.read.by_name import BodyPoint
