@@ -63,7 +63,9 @@ state = lx.assemble(mechanism)
 def told(tmp_path_factory):
     """Errors by the file that they are in, with their lines."""
     folder = tmp_path_factory.mktemp("programs")
-    notebooks = {path.stem: _code(path) for path in (ROOT / "notebooks").glob("*.ipynb")}
+    books = ROOT / "notebooks"
+    paths = [*books.glob("*.ipynb"), *books.glob("gallery/*.ipynb")]
+    notebooks = {path.stem: _code(path) for path in paths}
     programs = notebooks | {"right": RIGHT, "readme": "\n".join(BLOCKS), "wrong": BEGIN + "\n".join(WRONG)}
     for name, text in programs.items():
         (folder / f"{name}.py").write_text(text)
