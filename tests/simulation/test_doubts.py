@@ -19,7 +19,7 @@ def test_angles_that_may_be_degrees():
         lx.assemble(swing(), {"pin": 90.0})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        lx.assemble(swing(), {"pin": -6.2})
+        lx.assemble(swing(), {"pin": -9.4})
         lx.assemble(swing([lx.JointSpring("pin", 2.0)]), {"pin": 90.0})  # which counts turns
 
 

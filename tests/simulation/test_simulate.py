@@ -1,5 +1,7 @@
 """What simulate accepts, refuses, compiles, and returns."""
 
+import weakref
+
 import diffrax
 import equinox as eqx
 import jax
@@ -10,7 +12,6 @@ import pytest
 import linkax as lx
 from linkax.cli import progress_run
 from linkax.scenes import SCENES
-from linkax.simulation.read import reading
 from linkax.simulation.read.observables import Observables
 from linkax.xla.tracing import Program
 
@@ -105,10 +106,10 @@ def test_a_reading_is_computed_once(monkeypatch):
     assert computed == [Observables.solve, Observables.reactions]
     found.violation()
     assert computed[2:] == [Observables.violation_and_scales]
-    of_all, each = reading._of_solutions, id(found)
-    assert each in of_all
+    kept = weakref.ref(found.rank())
+    assert kept() is not None
     del found
-    assert each not in of_all
+    assert kept() is None
 
 
 def test_a_batch_equals_single_runs():

@@ -310,6 +310,7 @@ function showMechanism(contents, numbers, T) {
   renderer.domElement.addEventListener("pointermove", (event) => {
     const frame = renderer.domElement.getBoundingClientRect();
     const [x, y] = [event.clientX - frame.left, event.clientY - frame.top];
+    [scene, camera].forEach((object) => object.updateMatrixWorld()); // they may have moved since the last frame
     ray.setFromCamera(new T.Vector2((2 * x) / frame.width - 1, 1 - (2 * y) / frame.height), camera);
     const hit = ray.intersectObjects(hovered, false)[0];
     tip.style.display = hit ? "block" : "none";

@@ -93,9 +93,9 @@ def assemble(
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
     raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
     Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain; of speeds that fit several
-    branches; of angles beyond a whole turn, which may be degrees, but of joints whose turns a force or a constraint
-    counts; where no guess is given, of slides between moving bodies with lengths of both signs; and of a body between
-    two balls whose spin nothing decides. `linkax.assemblies` finds what other assemblies there are.
+    branches; of angles beyond one and a half turns, which may be degrees, but of joints whose turns a force or a
+    constraint counts; where no guess is given, of slides between moving bodies with lengths of both signs; and of a
+    body between two balls whose spin nothing decides. `linkax.assemblies` finds what other assemblies there are.
     """
     check_mechanism(mechanism)
     t = checked_time(t, "t")

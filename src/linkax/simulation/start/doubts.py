@@ -12,6 +12,7 @@ from linkax.simulation.start.places import SUFFIX
 from linkax.simulation.start.state import State
 
 TURN = 2.0 * np.pi
+MOST_TURNS = 1.5  # that are given for an angle; ten degrees are more radians than this
 
 
 def doubts(
@@ -35,7 +36,7 @@ def _many_turns(mechanism, values, what) -> Iterator[str]:
         units = alike.kind.speed_units if alike.index is None else (alike.kind.speed_units[alike.index],)
         for along, numbers in zip(alike.terms, np.asarray(rows), strict=True):
             for unit, angle in zip(units, numbers, strict=True):
-                if unit == "rad" and abs(angle) > TURN and along.joint not in counted:
+                if unit == "rad" and abs(angle) > MOST_TURNS * TURN and along.joint not in counted:
                     yield (
                         f"{what} of joint {along.joint!r} is {angle:.6g} rad, which is {abs(angle) / TURN:.3g} turns; "
                         f"if degrees are meant, give numpy.deg2rad({angle:.6g}), else an angle within one turn"
