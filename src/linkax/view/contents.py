@@ -14,6 +14,7 @@ from linkax.model.joints.free import Free
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.joints.planar import Planar
 from linkax.model.joints.prismatic import Prismatic
+from linkax.model.joints.rectangular import Rectangular
 from linkax.model.joints.screw import Screw
 from linkax.model.joints.spherical import Spherical
 from linkax.model.joints.universal import Universal
@@ -33,7 +34,7 @@ from linkax.scenery.scenery import (
 FLAT = 1e-6  # size of a singular value, relative to the largest, up to which marked points lie in a plane or line
 SYMBOLS = {
     Cylindrical: "sleeve", Screw: "sleeve", Prismatic: "box", Spherical: "ball", Universal: "cross", Fixed: "weld",
-    Planar: "plate", Free: None, Distance: None,
+    Planar: "plate", Rectangular: "plate", Free: None, Distance: None,
 }  # fmt: skip
 
 
