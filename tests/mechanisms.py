@@ -24,6 +24,19 @@ def crank_slider(cut=None, order=1, offset=(0.0, 0.0, 0.0), rod=1.3):
     return lx.Mechanism([crank, link, slider], joints[::order], [lx.Gravity([0.0, -9.81, 0.0])])
 
 
+def coupler_between_balls():
+    """An arm that moves a slide by a coupler, whose spin nothing holds."""
+    arm, slider = lx.rod("arm", 0.5, 1.0), lx.point_mass("slider", 1.0)
+    coupler = lx.rod("coupler", 1.0, 1.0, thickness=0.1)
+    joints = [
+        lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z"),
+        lx.Spherical("near", arm.at("tip"), coupler.at("base")),
+        lx.Spherical("far", coupler.at("tip"), slider),
+        lx.Prismatic("guide", lx.GROUND.at([0.0, 0.0, 0.2]), slider, axis="x"),
+    ]
+    return lx.Mechanism([arm, coupler, slider], joints)
+
+
 def sarrus():
     """Two legs of two links in perpendicular planes, which carry a platform that only rises and falls."""
     length, mass, width, out = 0.5, 0.5, 0.02, np.array([0.4, 0.0, 0.0])

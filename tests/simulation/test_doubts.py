@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from mechanisms import coupler_between_balls
 
 import linkax as lx
 
@@ -42,15 +43,7 @@ def test_struts_of_lengths_of_both_signs():
 
 def test_a_spin_that_nothing_decides():
     """Of a coupler between two balls: asked for, it is as asked."""
-    arm, slider = lx.rod("arm", 0.5, 1.0), lx.point_mass("slider", 1.0)
-    coupler = lx.rod("coupler", 1.0, 1.0, thickness=0.1)
-    joints = [
-        lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z"),
-        lx.Spherical("near", arm.at("tip"), coupler.at("base")),
-        lx.Spherical("far", coupler.at("tip"), slider),
-        lx.Prismatic("guide", lx.GROUND.at([0.0, 0.0, 0.2]), slider, axis="x"),
-    ]
-    mechanism = lx.Mechanism([arm, coupler, slider], joints)
+    mechanism = coupler_between_balls()
     told = "nothing decides how fast body 'coupler' spins about the line between 'near' and 'far'"
     with pytest.warns(lx.AssemblyWarning, match=told) as warned:
         found = lx.assemble(mechanism, {"hinge": 1.0}, {"hinge": 2.0})

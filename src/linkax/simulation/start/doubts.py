@@ -33,9 +33,8 @@ def _many_turns(mechanism, values, what) -> Iterator[str]:
     for alike, rows in zip(values.groups, values.values, strict=True):
         if alike.kind.has_quaternion or alike.kind.is_screw:
             continue
-        units = alike.kind.speed_units if alike.index is None else (alike.kind.speed_units[alike.index],)
         for along, numbers in zip(alike.terms, np.asarray(rows), strict=True):
-            for unit, angle in zip(units, numbers, strict=True):
+            for unit, angle in zip(alike.units, numbers, strict=True):
                 if unit == "rad" and abs(angle) > MOST_TURNS * TURN and along.joint not in counted:
                     yield (
                         f"{what} of joint {along.joint!r} is {angle:.6g} rad, which is {abs(angle) / TURN:.3g} turns; "

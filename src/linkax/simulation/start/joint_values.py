@@ -29,6 +29,11 @@ class TermsAlike(NamedTuple):
     in_tree: bool
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the speeds of each term."""
+        return self.kind.speed_units if self.index is None else (self.kind.speed_units[self.index],)
+
+    @property
     def names(self) -> list[str]:
         """The joints."""
         return [along.joint for along in self.terms]
@@ -99,10 +104,7 @@ class JointValues(eqx.Module):
 
     def slides(self) -> Bool[np.ndarray, " _"]:
         """Which changes, of those that `apart` gives, are lengths, in the order of `flat`."""
-        lengths = []
-        for alike in self.groups:
-            units = alike.kind.speed_units if alike.index is None else (alike.kind.speed_units[alike.index],)
-            lengths += [unit == "m" for _ in alike.terms for unit in units]
+        lengths = [unit == "m" for alike in self.groups for _ in alike.terms for unit in alike.units]
         return np.array(lengths, dtype=bool)
 
     def flat(self) -> Float[Array, " _"]:
