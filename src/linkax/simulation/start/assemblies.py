@@ -86,7 +86,8 @@ def assemblies(
         )
     if not distinct:
         return [assemble(mechanism, positions, t=t)]  # which tries harder, or tells why not
-    return [State(jnp.asarray(found.q[index]), jnp.asarray(found.v[index])) for index in distinct]
+    state = lambda index: State(jnp.asarray(found.q[index]), jnp.asarray(found.v[index]), mechanism.topology)
+    return [state(index) for index in distinct]
 
 
 class _Found(NamedTuple):

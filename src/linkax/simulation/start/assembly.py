@@ -108,6 +108,7 @@ def assemble(
     given = flat_with_known(measured), held, moving, begin, t
     with compiling(all_concrete(given) and is_first(assemble, jax.tree.structure(given))):
         state, remainder = _assembled(*given)
+    state = State(state.q, state.v, mechanism.topology)  # without the joints that only measured
     if not all_concrete((state, remainder)):
         return _marked(mechanism, state, remainder)
     remainder = jax.tree.map(np.asarray, remainder)
