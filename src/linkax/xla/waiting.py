@@ -30,7 +30,7 @@ def _is_notebook():
 def tell(text: str) -> None:
     """Show a text in place of the one before."""
     if _is_notebook():
-        from IPython.display import display
+        from IPython.display import display  # pyright: ignore[reportMissingImports]  (notebooks bring it)
 
         if not _in_notebook:
             _in_notebook.append(display({"text/plain": ""}, raw=True, display_id=True))
