@@ -72,6 +72,20 @@ def test_derivatives_agree_with_differences(name):
     np.testing.assert_allclose(relative[:, closes], differences[:, closes], atol=1e-6)
 
 
+def test_a_number_of_python_that_a_law_closes_over():
+    """JAX differentiates it as such, and not as an array."""
+
+    def height(rate):
+        arm = lx.rod("arm", length=2.0, mass=1.0)
+        hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
+        mechanism = lx.Mechanism([arm], [hinge], constraints=[lx.Drive("drive", "hinge", lambda t: rate * t)])
+        state = lx.assemble(mechanism, t=0.5)
+        return lx.Solution.of_state(mechanism, state, t=0.5).position("arm", at="tip")[-1, 1]
+
+    np.testing.assert_allclose(jax.grad(height)(1.0), 2.0 * np.cos(0.5) * 0.5, rtol=1e-9)
+    np.testing.assert_allclose(jax.jvp(height, (1.0,), (1.0,))[1], 2.0 * np.cos(0.5) * 0.5, rtol=1e-9)
+
+
 def test_fit_of_a_mass_alone():
     """That no loop depends on, with the state assembled inside of the residual."""
 

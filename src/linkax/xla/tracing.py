@@ -12,6 +12,7 @@ from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer, eval_context
@@ -37,7 +38,8 @@ def all_concrete(tree: PyTree) -> bool:
 
 def without_derivatives(tree: PyTree) -> PyTree:
     """The same numbers, constant for derivatives: concrete where they are differentiated outside of `jit`."""
-    return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if isinstance(leaf, Tracer) else leaf, tree)
+    # Arrays again: JAX differentiates a number of Python's as one.
+    return jax.tree.map(lambda leaf: jnp.asarray(lax.stop_gradient(leaf)) if isinstance(leaf, Tracer) else leaf, tree)
 
 
 class Program(Generic[Output]):
