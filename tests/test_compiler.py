@@ -17,7 +17,7 @@ from linkax.xla import flags as xla_flags
 from linkax.xla import memory_maps
 from linkax.xla.flags import LOOPS, quickest_to_compile, set_flags
 from linkax.xla.memory_maps import ROOM
-from linkax.xla.tracing import Program
+from linkax.xla.program import Program
 
 
 def _as_users_do(name):

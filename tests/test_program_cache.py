@@ -1,52 +1,179 @@
 """Compiled programs on disk, in processes of their own."""
 
+import functools
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
+from mechanisms import crank_slider
 
 import linkax as lx
-from linkax.xla import program_cache
+from linkax.straight_line.known import flat_with_known
+from linkax.xla import kept_programs, program_cache
+from linkax.xla.descriptions import Undescribed, description
+from linkax.xla.program import Program
 
 SOURCE = Path(lx.__file__).parents[1]
 SETTINGS = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "EQX_ON_ERROR")
-PENDULUM = """
-import json, sys
-from collections import Counter
-import jax, jax.numpy as jnp
+TOLD = """
+import json, os, sys
+import jax, jax.numpy as jnp, numpy as np
 import linkax as lx
+from linkax.xla.program import Program
 
-told = Counter()
-jax.monitoring.register_event_listener(lambda event, **_: told.update([event.rpartition("/")[2]]))
+traced, asked, found = [], [], []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, _, **what: traced.append(what["fun_name"]) if event.endswith("jaxpr_trace_duration") else None
+)
+events = {"compile_requests_use_cache": asked, "cache_hits": found}
+jax.monitoring.register_event_listener(lambda event, **_: events.get(event.rpartition("/")[2], []).append(event))
 folder = lx.cache_programs(*sys.argv[1:])
+"""
+PENDULUM = (
+    TOLD
+    + """
+rate, own = float(os.environ.get("RATE", "1.0")), lambda t: rate * np.pi * t
 arm = lx.rod("arm", 1.0, 1.0)
 hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")
-mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -9.81, 0.0])])
-found = lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=1.0)
-force = found.reaction("hinge").force[-1].tolist()
-print(json.dumps([force, told["compile_requests_use_cache"], told["cache_hits"], folder]))
+forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointTorque("hinge", lambda t, motion: jnp.sin(own(t)))]
+mechanism = lx.Mechanism([arm], [hinge], forces)
+solution = lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=1.0)
+force = solution.reaction("hinge").force[-1].tolist()
+names = ("_check_start", "_closed", "_integrate", "_of_times")
+programs = [name for name in names if any(program.startswith(name) for program in traced)]
+print(json.dumps([force, programs, len(asked), len(found), folder]))
 """
+)
+SOLVE = (
+    TOLD
+    + """
+
+def solve_here(matrix, vector):
+    return jnp.linalg.solve(matrix, vector)
+
+solve = Program(solve_here)
+matrix = np.eye(40) + 0.1 * np.arange(40.0)[:, None]
+print(json.dumps([solve(matrix, np.ones(40)).tolist(), any(program.startswith("solve_here") for program in traced)]))
+"""
+)
 
 
-def ran(*arguments, **environment):
+def ran(*arguments, program=PENDULUM, **environment):
     """What the program prints at last, and what it warns of."""
     environment = {name: value for name, value in os.environ.items() if name not in SETTINGS} | environment
-    command = [sys.executable, "-c", PENDULUM, *map(str, arguments)]
+    command = [sys.executable, "-c", program, *map(str, arguments)]
     found = subprocess.run(command, capture_output=True, text=True, env=environment | {"PYTHONPATH": str(SOURCE)})
     assert found.returncode == 0, found.stderr
     return json.loads(found.stdout.splitlines()[-1]), found.stderr
 
 
-def test_a_second_process_compiles_nothing(tmp_path):
-    (force, asked, found, folder), _ = ran(tmp_path)
-    assert (found, folder) == (0, str(tmp_path))
+def test_a_second_process_traces_and_compiles_nothing(tmp_path):
+    """With functions of a user, which may hash otherwise there; another number in one is another program."""
+    (force, programs, asked, found, folder), _ = ran(tmp_path)
+    assert (programs, found, folder) == (["_check_start", "_closed", "_integrate", "_of_times"], 0, str(tmp_path))
     assert asked > 3
-    again, told = ran(JAX_COMPILATION_CACHE_DIR=str(tmp_path))
-    assert again == [force, asked, asked, str(tmp_path)]
+    again, told = ran(JAX_COMPILATION_CACHE_DIR=str(tmp_path), PYTHONHASHSEED="1")
+    assert (again[0], again[1], again[4]) == (force, [], str(tmp_path))
+    assert again[2] == again[3]
     assert "compiled again" not in told
+    other, _ = ran(tmp_path, RATE="2.0")
+    assert other[0] != force
+    assert "_integrate" in other[1]
+
+
+def test_kept_programs_call_lapack(tmp_path):
+    """Which JAX loads where it lowers, as it does not here; and a file cut short is none."""
+    matrix = np.eye(40) + 0.1 * np.arange(40.0)[:, None]
+    for traces in (True, False, True, False):
+        (found, traced), _ = ran(tmp_path, program=SOLVE)
+        np.testing.assert_allclose(found, np.linalg.solve(matrix, np.ones(40)), rtol=1e-12)
+        assert traced == traces
+        (file,) = (tmp_path / "linkax").iterdir()
+        assert b"lapack_" in file.read_bytes()
+        if not traces:
+            file.write_bytes(file.read_bytes()[:1000])
+
+
+@pytest.fixture
+def kept_in(tmp_path):
+    """A folder for programs of this process, of which it forgets all afterwards."""
+    kept_programs.keep_in(tmp_path)
+    yield tmp_path / "linkax"
+    kept_programs.keep_in(None)
+    kept_programs._met.clear()
+
+
+def test_programs_are_kept_by_their_kind(kept_in):
+    calls = []
+
+    def twice(numbers, more=1):
+        calls.append(numbers.shape)
+        return {"twice": 2.0 * numbers, "more": more}
+
+    program = Program(twice)
+    program.lower(np.ones(3)).compile()
+    blank = program.blank_result(np.ones(3))
+    np.testing.assert_array_equal(blank["twice"], np.zeros(3))
+    assert blank["more"] == 1
+    assert len(calls) == len(list(kept_in.iterdir())) == 1
+    np.testing.assert_array_equal(program(jnp.arange(3.0))["twice"], [0.0, 2.0, 4.0])
+    assert len(calls) == 1
+    assert program(np.ones(3), more=2)["more"] == 2
+    assert program(np.ones(4))["twice"].shape == (4,)
+    assert jax.jit(program)(np.ones(5))["twice"].shape == (5,)  # within another program
+    assert len(list(kept_in.iterdir())) == 3
+    kept_programs._met.clear()  # as another process
+    assert program(np.ones(3), more=2)["more"] == 2
+    assert len(calls) == 4
+
+
+def test_what_jax_found_is_not_written(kept_in, monkeypatch):
+    """It would not run."""
+    compile = jax.stages.Lowered.compile
+
+    def found(lowered):
+        jax.monitoring.record_event(kept_programs.FOUND)
+        return compile(lowered)
+
+    monkeypatch.setattr(jax.stages.Lowered, "compile", found)
+    np.testing.assert_array_equal(Program(lambda numbers: 2.0 * numbers)(np.ones(3)), 2.0 * np.ones(3))
+    assert not kept_in.exists()
+
+
+def test_what_calls_back_to_python_is_not_written(kept_in):
+    doubled = lambda numbers: jax.pure_callback(lambda given: 2.0 * np.asarray(given), numbers, numbers)
+    np.testing.assert_array_equal(Program(doubled)(np.ones(3)), 2.0 * np.ones(3))
+    assert not kept_in.exists()
+
+
+class Mine(eqx.Module):
+    number: float = 1.0
+
+
+def test_what_is_a_users_own_is_not_described():
+    """Its name may stay where what it does changes."""
+    for own in (Mine(), Mine, test_what_is_a_users_own_is_not_described, functools.partial(lambda: 1), object()):
+        with pytest.raises(Undescribed):
+            description(own)
+
+
+def test_equal_things_are_described_alike():
+    described = lambda **changes: description(jax.tree.structure(flat_with_known(crank_slider(**changes))))
+    assert described() == described()
+    assert described(rod=1.4) == described()  # a number, which programs are given
+    assert described(cut="guide") != described()
+    for one, other in ((1, 1.0), (0.0, -0.0), ((1,), [1]), ({"a": 1}, {"b": 1}), (np.zeros(2), np.zeros((2, 1)))):
+        assert description(one) == description(one)
+        assert description(one) != description(other)
+    assert description(diffrax.Dopri8()) == description(diffrax.Dopri8()) != description(diffrax.Dopri5())
 
 
 def test_the_default_folder_is_the_users(tmp_path, monkeypatch):

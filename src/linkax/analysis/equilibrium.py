@@ -26,7 +26,8 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.tracing import Program, all_concrete, evaluate_now
+from linkax.xla.program import Program
+from linkax.xla.tracing import all_concrete, evaluate_now
 
 BALANCED_STEP = 1e-8  # last step above which the search has failed [rad, lengths of the mechanism]
 

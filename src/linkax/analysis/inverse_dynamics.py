@@ -26,7 +26,8 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked, speeds_by_joint
 from linkax.tables import Rows, Table, numbers, printed_as
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program, concrete
+from linkax.xla.program import Program
+from linkax.xla.tracing import concrete
 
 JointKey = str | tuple[str, int]
 Accelerations = Mapping[JointKey, ArrayLike | Sequence[float]]

@@ -21,7 +21,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program
+from linkax.xla.program import Program
 
 INVOLVED = 1e-6  # entry of a self-stress of magnitude one up to which its row counts as not part of it
 # Table 1 of the paper: which axes of parent and child each rotation row keeps orthogonal.

@@ -39,7 +39,8 @@ from linkax.simulation.start.validation import checked_state, checked_time, mark
 from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.tracing import Program, all_concrete, concrete
+from linkax.xla.program import Program
+from linkax.xla.tracing import all_concrete, concrete
 
 NEAR = 1e-6  # distance from an equilibrium up to which a state counts as in it [rad, lengths of the mechanism]
 UNFELT = 1e-9  # forces that rounding leaves, relative to all forces

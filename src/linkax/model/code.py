@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from linkax.model.code_walk import Maker, Same, Undecided, Walk
+from linkax.xla.descriptions import description
 
 
 class Code:
@@ -74,6 +75,21 @@ class Code:
         now, numbers = Code.of(self.function)
         held = zip(self._arrays, numbers, strict=False)
         return now != self or any(ref is not None and ref() is not number for ref, number in held)
+
+
+@description.register
+def _(code: Code) -> Any:
+    return "code of a function", description(code._key)
+
+
+@description.register
+def _(same: Same) -> Any:
+    value = same.value
+    if isinstance(value, dict):  # the globals of a function: of them, what it reads is described apart
+        return "globals", value.get("__name__")
+    if isinstance(value, type):  # likewise of a class
+        return "class", value.__module__, value.__qualname__
+    return description(value)
 
 
 def _code_of(function: Callable[..., Any]) -> Code:

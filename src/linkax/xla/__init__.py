@@ -13,7 +13,10 @@ What we rely on (where; since which version), and what happens without it:
   and the warning comes.
 - the name `eqxi` in diffrax's module of `diffeqsolve`, by which it checks times (`diffrax_contract`; diffrax 0.7.2).
   Without it: programs call back to Python, so that JAX keeps none of a run on disk; a warning says so.
-- events of JAX's cache (`program_cache`; jax 0.10). Without them: the warning comes for each program, or never.
+- events of JAX's cache (`program_cache`, `kept_programs`; jax 0.10). Without them: the warning comes for each program,
+  or never, and programs that JAX found on disk may be written, which do not run.
+- `jax.experimental.serialize_executable`, that a program names what it calls of LAPACK, which lowering loads, and
+  "callback" where it calls Python (`kept_programs`; jax 0.10). Without it: later processes trace, or fail.
 - compiler options `xla_backend_optimization_level` and the like (`flags`; jaxlib 0.10). Without it: programs that run
   once compile twice as long.
 

@@ -11,6 +11,8 @@ import equinox as eqx
 import jax
 from jax.tree_util import register_pytree_node_class
 
+from linkax.xla.descriptions import description, of_each
+
 Tree = TypeVar("Tree")
 
 
@@ -32,6 +34,11 @@ class _Structure:
             return self is other
         same = self._hash == other._hash and self.noted == other.noted
         return same and self.treedef == other.treedef and self.others == other.others
+
+
+@description.register
+def _(structure: _Structure) -> Any:
+    return "structure", *of_each((structure.others, structure.treedef, structure.noted))
 
 
 @register_pytree_node_class

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 
 COMPILING = "/jax/core/compile/backend_compile_duration"  # what JAX tells its listeners before XLA compiles, and after
+CACHES = [eqx.clear_caches, jax.clear_caches]  # functions that let go of compiled programs
 ROOM = 10_000  # memory maps; the largest programs of linkax take 4000
 MAPS, LIMIT_OF_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 
@@ -21,15 +22,15 @@ def watch_memory_maps() -> None:
     jax.monitoring.register_scalar_listener(make_room)
 
 
-def make_room(event: str, *_time: Any, **_what: Any) -> None:
-    """Clear JAX's caches where too few memory maps are left for another program.
+def make_room(event: str = COMPILING, *_time: Any, **_what: Any) -> None:
+    """Clear all caches of programs where too few memory maps are left for another program.
 
     **Raises:** `RuntimeError` where other things hold the maps. XLA would end the process.
     """
     if event != COMPILING or _has_room():
         return
-    eqx.clear_caches()
-    jax.clear_caches()
+    for clear in CACHES:
+        clear()
     gc.collect()
     limit = _limit_of_maps()
     remedy = f"raise their limit (sysctl -w vm.max_map_count={4 * limit})"

@@ -12,6 +12,7 @@ from typing import Any, cast
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from linkax.xla.kept_programs import keep_in
 from linkax.xla.memory_maps import COMPILING
 
 ASKED = "/jax/compilation_cache/compile_requests_use_cache"  # what JAX tells its listeners of a program
@@ -25,9 +26,11 @@ def cache_programs(folder: str | os.PathLike | None = None) -> str:
     """Keep compiled programs on disk, so that later processes need not compile them again.
 
     Call it before anything is computed: what has been compiled is not kept. The command line does so by itself, unless
-    the environment has `JAX_ENABLE_COMPILATION_CACHE=false`.
+    the environment has `JAX_ENABLE_COMPILATION_CACHE=false`. On a processor, later processes need not even trace what
+    runs outside of JAX transformations, but where it has elements of one's own.
 
-    **Arguments:** `folder`: may be shared by processes, and removed at any time; by default `JAX_COMPILATION_CACHE_DIR`
+    **Arguments:** `folder`: may be shared by processes, and removed at any time; what is in it is run, so share it with
+    no one whom you do not trust; by default `JAX_COMPILATION_CACHE_DIR`
     of the environment, or else `linkax` in the user's folder for caches.
 
     **Returns:** the folder.
@@ -45,6 +48,7 @@ def cache_programs(folder: str | os.PathLike | None = None) -> str:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     compilation_cache.reset_cache()  # which JAX opens when it compiles first
+    keep_in(None if "://" in path else Path(path))
     _listen()
     return path
 

@@ -18,7 +18,8 @@ from linkax.simulation.explain.diagnosis import lost_inertia
 from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS, Solution
 from linkax.simulation.integrate.rosenbrock import Rodas5P
 from linkax.xla.enumerations import code, item
-from linkax.xla.tracing import Program, all_concrete
+from linkax.xla.program import Program
+from linkax.xla.tracing import all_concrete
 
 UNSEEN = 10.0  # tolerances: rounding of accelerations that adds little to the errors of steps
 UNSEEN_ULPS = 1e5

@@ -29,7 +29,8 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
 from linkax.xla.arrays import Array
 from linkax.xla.flat import Flat
-from linkax.xla.tracing import Program, all_concrete, blank_result, concrete, is_first, jit_inline
+from linkax.xla.program import Program, runs_often
+from linkax.xla.tracing import all_concrete, concrete, is_first
 from linkax.xla.undefined import undefined_where
 from linkax.xla.waiting import compiling
 
@@ -50,9 +51,9 @@ def integrate_run(run: Run) -> Outcome:
         with compiling(), ThreadPoolExecutor() as threads:
             # While XLA compiles one program, in a thread, Python traces the next.
             threads.submit(_check_start.lower(*given).compile)
-            initial = blank_result(_check_start, *given)
+            initial = _check_start.blank_result(*given)
             threads.submit(_integrate.lower(run, initial).compile)
-            integrated = blank_result(_integrate, run, initial)
+            integrated = _integrate.blank_result(run, initial)
             threads.submit(_closed.lower(*_closing(run, initial, integrated)).compile)
     initial = _check_start(*given)
     if concrete(sound := sound_numbers(run.mechanism)) is None:
@@ -87,7 +88,7 @@ def problem_of(
     return Problem(flat.tree, system, formulation.prepared(dtype, initial.rank), accuracy, *start)
 
 
-@jit_inline
+@runs_often
 def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     dtype = initial.state.q.dtype
     formulation, t0, t1, options, control = cast((run.formulation, run.t0, run.t1, run.options, run.control), dtype)
@@ -197,7 +198,7 @@ def _firsts(run):
     return None if ts is None else np.searchsorted(ts, ts)
 
 
-@jit_inline
+@runs_often
 def _closed(flat, formulation, accuracy, initial, times, values, saves, firsts) -> tuple[State, State | None]:
     """The state at the end, and those that are saved, on the loops; infinite where none was saved."""
     problem = problem_of(flat, formulation, accuracy, initial)

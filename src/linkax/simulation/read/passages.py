@@ -19,7 +19,7 @@ from linkax.simulation.explain.error_estimate import has_parts, num_saves, part_
 from linkax.simulation.integrate.results import ENDED_WELL, Solution, result_name
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program
+from linkax.xla.program import Program
 
 REFINEMENTS = 6
 POLISHES = 2

@@ -24,7 +24,8 @@ from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.flat import Flat
 from linkax.xla.kept import kept_while_alive
-from linkax.xla.tracing import Program, all_concrete, blank_result, is_first
+from linkax.xla.program import Program, runs_often
+from linkax.xla.tracing import all_concrete, is_first
 from linkax.xla.waiting import compiling
 
 FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
@@ -37,7 +38,7 @@ def read_in_motion(function: Callable[..., Any], solution: Solution, *details: A
         with compiling(), ThreadPoolExecutor() as threads:
             program, *given = _asked(solution, Observables.solve, (), ())
             threads.submit(program.lower(*given).compile)
-            program, *given = _asked(solution, function, blank_result(program, *given), details)
+            program, *given = _asked(solution, function, program.blank_result(*given), details)
             threads.submit(program.lower(*given).compile)
     return read(function, solution, *details, dynamics=read(Observables.solve, solution))
 
@@ -61,7 +62,7 @@ def _asked(solution, function, dynamics, details):
     few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
     states = solution.ts, solution.q, solution.v
     motion = SavedMotion(run.flat, run.formulation, run.tangent_space, solution.rank_nearby, *states)
-    return _of_times if few else _of_times.optimised, function, motion, dynamics, details
+    return _of_few if few else _of_many, function, motion, dynamics, details
 
 
 class SavedMotion(NamedTuple):
@@ -92,7 +93,6 @@ def _found(solution):
     return {}
 
 
-@Program
 def _of_times(function, motion: SavedMotion, dynamics, details):
     def of_member(motion, dynamics, details):
         dtype = motion.q.dtype
@@ -109,6 +109,9 @@ def _of_times(function, motion: SavedMotion, dynamics, details):
     for _ in range(motion.ts.ndim - 1):
         of_member = eqx.filter_vmap(of_member)
     return of_member(motion, dynamics, details)
+
+
+_of_few, _of_many = Program(_of_times), runs_often(_of_times)
 
 
 @eqx.filter_jit

@@ -25,7 +25,8 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import WorldPlaces, check_mechanism, checked_time, coordinates_by_joint
 from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import Program, all_concrete
+from linkax.xla.program import Program
+from linkax.xla.tracing import all_concrete
 
 SAME = 1e-6  # of the mechanism's length, or radians
 NOTHING = JointValues((), ())

@@ -37,8 +37,9 @@ from linkax.simulation.start.validation import (
 )
 from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array
+from linkax.xla.program import Program
 from linkax.xla.static_scatter import scatter_static
-from linkax.xla.tracing import Program, all_concrete, is_first, jit_inline, without_derivatives
+from linkax.xla.tracing import all_concrete, is_first, jit_inline, without_derivatives
 from linkax.xla.waiting import compiling
 
 GUESS = "give another guess, such as guess={body: lx.Pose(position)} with its rough place"

@@ -25,7 +25,7 @@ from linkax.spatial.vectors import largest
 from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import materialise, positive_or_one, pushforward, ratio
-from linkax.xla.tracing import Program
+from linkax.xla.program import Program
 
 TURNS = 30  # of Newton's method: from close to where y² = x² is flat, each but halves the way
 BESIDE = 1e-2
