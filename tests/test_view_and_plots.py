@@ -113,6 +113,7 @@ def picture(shown):
 def test_crank_slider_renders_plays_and_tells_names(browser, crank_slider, tmp_path):
     solution, points = crank_slider
     shown = opened(browser, solution.view(points=points, reactions=["guide"]), tmp_path)
+    shown.page.wait_for_function("linkax.playing() && linkax.time() > 0.0", timeout=20_000)
     assert_shows(shown, solution)
     drag_time(shown.page, 0.0)
     first = picture(shown)
@@ -165,6 +166,7 @@ def test_one_state_is_shown_without_time(browser, crank_slider, tmp_path):
     view = solution.mechanism.view(solution.end, tmp_path / "state.html")
     shown = opened(browser, view, tmp_path)
     assert shown.page.locator("#play").is_disabled()
+    assert not shown.ask("linkax.playing()")
     end = solution.position("slider")[-1]
     np.testing.assert_allclose(shown.ask("linkax.position('slider')"), end, atol=1e-6)
     assert (tmp_path / "state.html").read_text() == view.html

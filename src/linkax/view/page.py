@@ -26,7 +26,8 @@ HEIGHT = 480  # in a notebook, in pixels
 class View:
     """A page with a mechanism in motion, for any browser, without network.
 
-    In a notebook it shows itself as the value of a cell. Drag turns it, the wheel zooms, space plays and pauses.
+    In a notebook it shows itself as the value of a cell. It plays when it is opened; drag turns it, the wheel zooms,
+    space pauses and plays.
 
     - `html`: the page as text.
     """

@@ -95,11 +95,12 @@ function showMechanism(contents, numbers, T) {
       edged(new T.ConvexGeometry(corners.map((corner) => vector(corner))), colour, label, group, 0.6);
     },
     box({ centre: at, axes, half }, colour, label, group) {
-      const solid = edged(new T.BoxGeometry(...half.map((length) => 2 * Math.max(length, 1e-3 * unit))), colour, label, group);
+      const size = half.map((length) => 2 * Math.max(length, 1e-3 * unit));
+      const solid = edged(new T.BoxGeometry(...size), colour, label, group, 0.6); // shows joints and bodies inside
       turn(solid, axes).position.copy(vector(at));
     },
     ellipsoid({ centre: at, axes, half }, colour, label, group) {
-      const solid = mesh(new T.SphereGeometry(1, 32, 24), colour, label, group);
+      const solid = mesh(new T.SphereGeometry(1, 32, 24), colour, label, group, 0.6);
       turn(solid, axes).position.copy(vector(at));
       solid.scale.set(...half.map((length) => Math.max(length, 1e-3 * unit)));
     },
@@ -251,7 +252,7 @@ function showMechanism(contents, numbers, T) {
 
   // --- Time --------------------------------------------------------------------------------------------------------
   const [first, last] = [times[0], times[times.length - 1]];
-  let now = first, playing = false, before = null, dirty = true;
+  let now = first, playing = false, before = null, dirty = true, seen = true;
   const redraw = () => { dirty = true; };
 
   // The saved time before a time, and which share of the way to the next one has gone.
@@ -332,6 +333,7 @@ function showMechanism(contents, numbers, T) {
 
   function render(milliseconds) {
     requestAnimationFrame(render);
+    if (!seen) { before = null; return; }
     if (playing) {
       const passed = before === null ? 0 : (milliseconds - before) / 1000;
       before = milliseconds;
@@ -357,9 +359,11 @@ function showMechanism(contents, numbers, T) {
 
   controls.addEventListener("change", redraw);
   new ResizeObserver(fit).observe(stage);
+  new IntersectionObserver(([entry]) => { seen = entry.isIntersecting; }).observe(stage);
   fit();
   seek(first);
   home();
+  setPlaying(!matchMedia("(prefers-reduced-motion: reduce)").matches);
   requestAnimationFrame(render);
 
   const body = (name) => bodies.find((entry) => entry.name === name);
