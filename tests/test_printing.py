@@ -45,6 +45,14 @@ def test_a_state_names_joints_with_units():
     assert "bearing" not in repr(lx.State(state.q, state.v))
 
 
+def test_a_drive_tells_speed_and_start_with_units():
+    load = lx.point_mass("load", 1.0)
+    lift = lx.Prismatic("lift", lx.GROUND, load, axis="y")
+    winch = lx.Drive("winch", "lift", speed=0.5, start=2.0)
+    printed = repr(lx.Mechanism([load], [lift], constraints=[winch]))
+    assert any(row.split() == "winch Drive lift, speed 0.5 m/s, start 2 m".split() for row in printed.splitlines())
+
+
 def test_what_is_traced_or_missing_shows_shapes():
     mechanism = mechanism_of("planar-four-bar")
     state, seen = at_zero(mechanism), []

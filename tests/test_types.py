@@ -32,6 +32,7 @@ forces = [
     lx.JointTorque("hinge", lambda t, motion: jnp.sin(t)),
 ]
 mechanism = lx.Mechanism([arm, box, point], joints, forces, [lx.Drive("motor", "hinge", lambda t: 2.0 * t)])
+steady = lx.Drive("steady", ("ball", 1), speed=2, start=np.float64(0.3))
 state = lx.assemble(mechanism, {"hinge": 0.3}, {("ball", 1): 0.0}, guess={"slide": 1})
 rough = {"hinge": 0.3, "box": lx.Pose([1.0, 0.0, 0.0]), "arm.tip": [1.0, 0.1, 0.0]}
 state = lx.assemble(mechanism, {"box": lx.Pose([1.0, 0, 0])}, {"arm": lx.Velocity(angular=[0, 0, 1])}, guess=rough)

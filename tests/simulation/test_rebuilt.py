@@ -76,6 +76,26 @@ def test_derivatives_by_an_array_that_drives_close_over():
     np.testing.assert_allclose(found, np.stack(differences, axis=1), atol=1e-8)
 
 
+def cruised(speed, start):
+    """Angle and speed after half a second of an arm that turns at constant speed."""
+    arm = lx.rod("arm", 1.0, 1.0)
+    motor = lx.Drive("motor", "hinge", speed=speed, start=start)
+    mechanism = lx.Mechanism([arm], [lx.Revolute(*HINGE, arm.at("base"), "z")], constraints=[motor])
+    found = lx.simulate(mechanism, lx.assemble(mechanism), t1=0.5, saveat=diffrax.SaveAt(t1=True))
+    return jnp.array([found.q[-1, 0], found.v[-1, 0]])
+
+
+def test_another_constant_speed_compiles_nothing():
+    first = cruised(6.0, 0.3)
+    with compilations() as compiled:
+        other = cruised(-2.0, 1.5)
+    assert not compiled
+    np.testing.assert_allclose(first, [3.3, 6.0], rtol=1e-13)
+    np.testing.assert_allclose(other, [0.5, -2.0], rtol=1e-13)
+    by_speed, by_start = jax.jit(jax.jacfwd(cruised, (0, 1)))(6.0, 0.3)
+    np.testing.assert_allclose([by_speed, by_start], [[0.5, 1.0], [1.0, 0.0]], atol=1e-12)
+
+
 def test_a_mechanism_whose_functions_have_changed_is_refused():
     speeds = {"motor": 2.0}
     arm = lx.rod("arm", 1.0, 1.0)

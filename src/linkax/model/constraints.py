@@ -94,10 +94,11 @@ class Coupling(LinearConstraint):
 
 
 class Drive(LinearConstraint):
-    """A joint's coordinate as a given function of time.
+    """A joint's coordinate as a given function of time, or at constant speed.
 
-    `Drive("motor", "bearing", lambda t: 2.0 * t)` turns `bearing` at 2 rad/s. Its reaction is the driving torque
-    [N m], or force [N] on a slide, along the joint.
+    `Drive("motor", "bearing", speed=6.0, start=0.3)` turns `bearing` at 6 rad/s, from 0.3 rad at t = 0.
+    `Drive("motor", "bearing", lambda t: 0.3 * jnp.sin(t))` swings it. Its reaction is the driving torque [N m], or
+    force [N] on a slide, along the joint.
 
     **Arguments:**
 
@@ -105,19 +106,43 @@ class Drive(LinearConstraint):
     - `joint`: a joint's name, or (name, index) for one of several coordinates, counted like speeds.
     - `motion`: t [s] ↦ coordinate [rad or m], twice differentiable by JAX. JAX arrays that it closes over are
       traced; all else that it reads is structure, and must not change later.
+    - `speed`: [rad/s or m/s], in place of `motion`. `start`: the coordinate at t = 0 [rad or m], zero by default. Both
+      are numbers of the mechanism: new ones compile nothing.
 
-    **Raises:** `ValueError` for a function that does not return one number.
+    **Raises:** `ValueError` for a function that does not return one number, for a wrong number, for neither `motion`
+    nor `speed`, and for both.
     """
 
-    motion: Law
+    motion: Law | None
+    speed: Scalar | None
+    start: Scalar | None
 
-    def __init__(self, name: str, joint: TermLike, motion: Callable[[Any], Number]) -> None:
+    def __init__(
+        self,
+        name: str,
+        joint: TermLike,
+        motion: Callable[[Any], Number] | None = None,
+        *,
+        speed: Number | None = None,
+        start: Number | None = None,
+    ) -> None:
         self.name = checked_name(name, "drive")
-        self.related = (term(joint, f"drive {name!r}"),)
+        what = f"drive {name!r}"
+        self.related = (term(joint, what),)
         self.coefficients = np.ones(1)
+        self.motion = self.speed = self.start = None
+        if motion is None and speed is None:
+            raise ValueError(f"{what} has no motion; give a function of time, lambda t: ..., or speed=")
+        if motion is None:
+            self.speed = number(speed, (), f"{what}: speed")
+            self.start = number(0.0 if start is None else start, (), f"{what}: start")
+            return
         if not callable(motion):
-            raise ValueError(f"drive {name!r}: motion is {motion!r}; give a function of time, lambda t: ...")
-        self.motion = Law(motion, (), f"drive {name!r}")
+            raise ValueError(f"{what}: motion is {motion!r}; give a function of time, lambda t: ..., or speed=")
+        for other, entry in (("speed", speed), ("start", start)):
+            if entry is not None:
+                raise ValueError(f"{what}: {other} is {entry!r}, and motion a function; give one of both")
+        self.motion = Law(motion, (), what)
         jax.eval_shape(self.motion, jnp.zeros(()))
 
     @property
@@ -125,11 +150,13 @@ class Drive(LinearConstraint):
         return True
 
     def right_side(self, t: Number) -> Scalar:
-        return self.motion(t)
+        if self.motion is not None:
+            return self.motion(t)
+        return self.start + self.speed * t
 
     def held(self, t: Number, unless: Any = False) -> "Drive | Coupling":
         if unless is not False:
-            return Drive(self.name, self.terms[0], held_unless(self.motion, t, unless))
+            return Drive(self.name, self.terms[0], held_unless(self.right_side, t, unless))
         return Coupling(self.name, {self.terms[0]: 1.0}, self.right_side(t))
 
 

@@ -18,9 +18,15 @@ UNITS = {
     "length": "m", "pitch": "m/rad",
 }  # fmt: skip
 UNITS_ALONG = {
-    "rad": {"stiffness": "N m/rad", "damping": "N m s/rad", "torque": "N m", "free": "rad", "scale": "rad/s"},
-    "m": {"stiffness": "N/m", "damping": "N s/m", "torque": "N", "free": "m", "scale": "m/s"},
-}
+    "rad": {
+        "stiffness": "N m/rad", "damping": "N m s/rad", "torque": "N m", "free": "rad", "scale": "rad/s",
+        "speed": "rad/s", "start": "rad",
+    },
+    "m": {
+        "stiffness": "N/m", "damping": "N s/m", "torque": "N", "free": "m", "scale": "m/s",
+        "speed": "m/s", "start": "m",
+    },
+}  # fmt: skip
 FRAMES = ("axis", "second_axis", "coefficients")  # which the tables leave out
 
 
@@ -42,11 +48,12 @@ def described(mechanism: Mechanism) -> Table:
     masses = [known(body.mass) for body in mechanism.bodies]
     if not any(mass is None or mass.shape for mass in masses):
         title += f"; {numbers(np.sum(masses), 'kg')}"
+    constraints = [_constraint_row(topology, constraint) for constraint in mechanism.constraints]
     parts = [
         Rows(("body", "mass", "centre of mass", "moments of inertia"), [*map(_body_row, bodies)], "bodies"),
         Rows(("beam", "length", "elements", "damping"), [_beam_row(beam) for beam in mechanism.beams], "beams"),
         Rows(("joint", "type", "from", "to", "in"), [_joint_row(*pair) for pair in joints], "joints"),
-        Rows(("constraint", "type", "of"), [*map(_constraint_row, mechanism.constraints)], "constraints"),
+        Rows(("constraint", "type", "of"), constraints, "constraints"),
         Rows(("force", "numbers"), [_force_row(topology, *pair) for pair in forces], "forces"),
     ]
     return Table(title, [part for part in parts if part.rows])
@@ -84,17 +91,23 @@ def _place(frame):
     return f"{frame.body} at {numbers(at, 'm', 1)}" if somewhere else frame.body
 
 
-def _constraint_row(constraint):
+def _constraint_row(topology, constraint):
     of = [*constraint.joints, *(frame.body for frame in constraint.frames)]
-    return constraint.name, type(constraint).__name__, ", ".join([*of, *_own_numbers(constraint, UNITS)])
+    own = _own_numbers(constraint, _units(topology, constraint))
+    return constraint.name, type(constraint).__name__, ", ".join([*of, *own])
 
 
 def _force_row(topology, name, force):
+    return name, ", ".join(_own_numbers(force, _units(topology, force)))
+
+
+def _units(topology, element):
+    """Units of an element's numbers: along a joint where it acts along one."""
     units = UNITS
-    for term in force.terms:
+    for term in element.terms:
         kind = topology.joint_types[topology.joint_index(term.joint)]
         units = UNITS_ALONG[kind.speed_units[term.index or 0]]
-    return name, ", ".join(_own_numbers(force, units))
+    return units
 
 
 def _own_numbers(element, units):

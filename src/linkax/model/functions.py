@@ -112,10 +112,10 @@ def evaluated(entry: Numbers | Law, *arguments: Any) -> Numbers | jax.Array:
     return entry(*arguments) if isinstance(entry, Law) else entry
 
 
-def held_unless(law: Law, t: Number, moves: Any) -> Callable[..., Any]:
+def held_unless(law: Callable[[Any], Any], t: Number, moves: Any) -> Callable[..., Any]:
     """Return a function of time that goes on where `moves`, and elsewhere keeps its value at time t."""
     return jax.tree_util.Partial(_held_unless, law, t, moves)
 
 
-def _held_unless(law: Law, start: Number, moves: Any, t: Number) -> jax.Array:
+def _held_unless(law: Callable[[Any], Any], start: Number, moves: Any, t: Number) -> jax.Array:
     return law(start) + jnp.where(moves, law(t) - law(start), 0.0)
