@@ -67,6 +67,41 @@ def test_contradicting_positions_and_speeds():
         ask(2.0 * np.cos(0.3), 5.0)
 
 
+def driven_slider(rod=1.5):
+    free = crank_slider(rod=rod)
+    return lx.Mechanism(free.bodies, free.joints, constraints=[lx.Drive("motor", "bearing", speed=2.0, start=1.2)])
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        (
+            ({"bearing": 0.4},),
+            r"position .* 'bearing' is 0\.4 rad, and drive 'motor' holds it at 1\.2 rad at t = 0 s; leave",
+        ),
+        (
+            (None, {"bearing": 3.0}),
+            r"speed .* 'bearing' is 3 rad/s, and drive 'motor' holds it at 2 rad/s at t = 0 s; leave",
+        ),
+        (({"guide": 0.4},), r"does not close.*positions held: 'guide'; drive 'motor' holds 'bearing' at 1\.2 rad"),
+        ((None, {"guide": 0.4}), r"'guide' is missed by .*given \(drive 'motor' holds 'bearing' at 2 rad/s\)"),
+    ],
+)
+def test_errors_tell_what_drives_hold(asked, told):
+    with pytest.raises(lx.AssemblyError, match=told):
+        lx.assemble(driven_slider(), *asked)
+
+
+def test_lengths_that_fit_no_place_of_a_drive_name_it():
+    with pytest.raises(lx.AssemblyError, match=r"positions held: none; drive 'motor' holds 'bearing' at 1\.2 rad"):
+        lx.assemble(driven_slider(rod=0.5))
+
+
+def test_what_a_drive_asks_may_be_given_too():
+    state = lx.assemble(driven_slider(), {"bearing": 5.2}, {"bearing": 2.0}, t=2.0)
+    np.testing.assert_allclose([state.q[0], state.v[0]], [5.2, 2.0], atol=1e-12)
+
+
 def test_unknown_names_and_wrong_numbers():
     with pytest.raises(ValueError, match="unknown joint 'pin'; known"):
         lx.assemble(crank_slider(), {"pin": 1.0})

@@ -15,6 +15,7 @@ from linkax.equations.coordinates import neutral, on_manifold
 from linkax.equations.gaps import Gap, gaps
 from linkax.equations.system import system_of
 from linkax.formulations.constraint_split import ConstraintSplit
+from linkax.model.constraints import Drive
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number
 from linkax.simulation.start.branch_speeds import other_speeds, smallest_speeds, speeds_again, speeds_on_branch
@@ -90,7 +91,8 @@ def assemble(
     loops. A guess of cut joints or places has no derivative.
 
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
-    cannot be closed, or the joints whose motion branches where the speeds lie on no branch;
+    cannot be closed, with what is held, by drives too; or the joints whose motion branches where the speeds lie on no
+    branch;
     `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
     raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
     Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain; of speeds that fit several
@@ -113,7 +115,7 @@ def assemble(
     if not all_concrete((state, remainder)):
         return _marked(mechanism, state, remainder)
     remainder = jax.tree.map(np.asarray, remainder)
-    _raise_if_open(mechanism, state, t, remainder)
+    _raise_if_open(mechanism, state, t, remainder, held, moving)
     for beam, (strain, energy) in remainder.strained.items():
         if strain > remainder.most:
             warnings.warn(
@@ -143,37 +145,84 @@ def _open_speeds(mechanism, measured, speeds, t, state):
     return ", ".join(map(repr, names))
 
 
-def _raise_if_open(mechanism, state, t, remainder):
+def _raise_if_open(mechanism, state, t, remainder, held, moving):
+    for message in _open(mechanism, state, t, remainder):
+        raise AssemblyError(next(_contradictions(mechanism, t, remainder.most, held, moving), message))
+
+
+def _contradictions(mechanism, t, most, held, moving):
+    """Tell where drives ask for other positions or speeds of their joints than are given."""
+    for what, given, remedy in (
+        ("position", held, "start the drive there"),
+        ("speed", moving, "give the drive that speed"),
+    ):
+        for drive, kind, asked, unit in _drives(mechanism, t, what):
+            joint, index = drive.terms[0]
+            for along, entries in given.by_term():
+                if along.joint != joint or along.index not in (None, index or 0):
+                    continue
+                before = what == "position" and kind.has_quaternion  # with one number more than speeds
+                value = float(entries[(index or 0) + before if along.index is None else 0])
+                if not abs(value - asked) <= most:
+                    yield (
+                        f"the {what} asked of joint {joint!r} is {value:.6g} {unit}, and {drive.display_name} holds it "
+                        f"at {asked:.6g} {unit} at t = {float(t):.6g} s; leave it out of {what}s, or {remedy}"
+                    )
+
+
+def _drives(mechanism, t, what):
+    """Drives, with the kind of their joints, and the position or speed that they ask for at time t, with its unit."""
     topology = mechanism.topology
-    held = ", ".join(dict.fromkeys(repr(along.joint) for along, _ in remainder.positions.by_term())) or "none"
-    remains = lambda size, unit: f"a gap of {size:.6g} {unit} remains (positions held: {held})"
+    for drive in mechanism.constraints:
+        if isinstance(drive, Drive):
+            joint, index = drive.terms[0]
+            kind = topology.joint_types[topology.joint_index(joint)]
+            law, per = (drive.right_side, "") if what == "position" else (jax.jacfwd(drive.right_side), "/s")
+            yield drive, kind, float(law(t)), kind.speed_units[index or 0] + per
+
+
+def _open(mechanism, state, t, remainder):
+    """Tell what is not met, the most telling first."""
+    topology = mechanism.topology
+
+    def driven(what):
+        return [
+            f"{drive.display_name} holds {drive.terms[0].joint!r} at {asked:.6g} {unit}"
+            for drive, _, asked, unit in _drives(mechanism, t, what)
+        ]
+
+    def remains(size, unit):
+        held = ", ".join(dict.fromkeys(repr(along.joint) for along, _ in remainder.positions.by_term())) or "none"
+        held = "; ".join([f"positions held: {held}", *driven("position")])
+        return f"a gap of {size:.6g} {unit} remains ({held})"
+
     advice = f"check lengths and offsets, hold fewer positions, or {GUESS}"
     gap, scaled = remainder.gap, remainder.gap_in_scales
     for cut, name in enumerate(topology.joints[topology.num_bodies :]):
         for size, in_scales, unit in ((gap.distance, scaled.distance, "m"), (gap.angle, scaled.angle, "rad")):
             if not in_scales[cut] <= CLOSED:
-                raise AssemblyError(f"joint {name!r} does not close: {remains(size[cut], unit)}; {advice}")
+                yield f"joint {name!r} does not close: {remains(size[cut], unit)}; {advice}"
     for constraint, size, in_scales in zip(mechanism.constraints, gap.constraints, scaled.constraints, strict=True):
         if not in_scales <= CLOSED:
             joints = f" of joint {', '.join(map(repr, constraint.joints))}" if constraint.joints else ""
-            raise AssemblyError(
+            yield (
                 f"{constraint.display_name}{joints} is not met at t = {float(t):.6g} s: "
                 f"{remains(size, 'rad or m')}; {advice}"
             )
     for what, misses in (("position", remainder.positions), ("speed", remainder.speeds)):
         for along, miss in misses.by_term():
             if not np.all(np.abs(miss) <= remainder.most):
-                size = np.max(np.abs(miss))
-                raise AssemblyError(
-                    f"the {what} asked of {called(along.joint)} is missed by {size:.6g}; the loops do not "
-                    f"allow it together with the other {what}s given, so ask for fewer"
+                size, drives = np.max(np.abs(miss)), "; ".join(driven(what))
+                yield (
+                    f"the {what} asked of {called(along.joint)} is missed by {size:.6g}; the loops do not allow it "
+                    f"together with the other {what}s given{f' ({drives})' if drives else ''}, so ask for fewer"
                 )
     tolerance = np.asarray(rank_tolerance(state.q.dtype))  # with which nothing is compiled
     if not remainder.off_branch <= ON_BRANCH * tolerance:
         system = system_of(mechanism, state.q.dtype)
         basis = ConstraintSplit.at(system, t, state.q, tolerance).inverse.basis
         names = ", ".join(map(repr, moving_joints(system, t, state.q, basis)))
-        raise AssemblyError(
+        yield (
             "the configuration is singular, and the speeds asked lie on no branch of the motion; its branches cross "
             f"in the motion of joints {names}, so ask for the speeds of other joints among them, or of fewer"
         )
