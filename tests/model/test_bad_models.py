@@ -159,7 +159,24 @@ def test_one_element_in_place_of_a_list_is_named(place):
     elements = {"bodies": link, "joints": lx.Revolute("pin", lx.GROUND, link, "z")}
     one = elements | {"forces": lx.Gravity([0.0, 0.0, -9.81]), "constraints": lx.Drive("motor", "pin", jnp.sin)}
     given = {name: [element] for name, element in elements.items()} | {place: one[place]}
-    refused(lambda: lx.Mechanism(**given), place, "list")
+    refused(lambda: lx.Mechanism(**given), f"{place} is one element", "list")
+
+
+def test_an_element_in_the_wrong_list_is_named_with_the_right_one():
+    link = lx.rod("link", 1.0, 1.0)
+    pin, drive = lx.Revolute("pin", lx.GROUND, link, "z"), lx.Drive("drive", "pin", speed=1.0)
+    spring, gears = lx.Spring(lx.GROUND, link.at("tip"), 1.0, name="strut"), lx.Coupling("gears", {"pin": 1.0})
+    rod = lx.Distance("stay", lx.GROUND, link.at("tip"), 1.0)
+    elements = {"bodies": [link], "joints": [pin]}
+    right = {"RigidBody 'link'": link, "Revolute 'pin'": pin, "Spring 'strut'": spring, "coupling 'gears'": gears}
+    homes = dict(zip(right, ("bodies", "joints", "forces", "constraints"), strict=True))
+    for name, element in right.items():
+        for place in ("bodies", "joints", "forces", "constraints"):
+            if place != homes[name]:
+                build = lambda place=place, element=element: lx.Mechanism(**elements | {place: [element]})
+                refused(build, f"{name} belongs in {homes[name]}=[...]; take it out of {place}")
+    refused(lambda: lx.Mechanism([link], [pin], [drive]), "drive 'drive' belongs in constraints=[...]")
+    refused(lambda: lx.Mechanism([link], [pin], [rod]), "Distance 'stay' belongs in constraints=[...]")
 
 
 def test_second_axes_that_are_known_are_checked_whatever_they_are():

@@ -113,20 +113,44 @@ class Mechanism(eqx.Module):
         return Solution.of_state(self, state).view(path, **settings)
 
 
+# What belongs into each argument, and what to give; a `Distance`, which is a joint, first of all among constraints.
+ARGUMENTS = {
+    "constraints": ((AbstractConstraint, Distance), "give a list of Coupling, Drive, Rope or Distance"),
+    "bodies": ((RigidBody, Beam), "give a list of RigidBody or Beam"),
+    "joints": (AbstractJoint, "give a list of Revolute, Prismatic and their like"),
+    "forces": (AbstractForce, "give a list of Gravity, Spring and their like"),
+}
+ELEMENTS = tuple(kinds for kinds, _ in ARGUMENTS.values())
+
+
 def _listed(
     bodies: Any, joints: Any, forces: Any, constraints: Any
 ) -> tuple[list[RigidBody | Beam], list[AbstractJoint], list[AbstractForce], list[AbstractConstraint]]:
     """Check and list what a user gives. A `Distance` moves from the constraints to the joints."""
-    remedy = "give a list of Coupling, Drive, Rope or Distance"
-    constraints = listed(constraints, (AbstractConstraint, Distance), "constraints", remedy)
-    joints = listed(joints, AbstractJoint, "joints", "give a list of Revolute, Prismatic and their like")
+    constraints, joints = _all_of("constraints", constraints), _all_of("joints", joints)
     joints = [*joints, *(c for c in constraints if isinstance(c, Distance))]
     constraints = [c for c in constraints if not isinstance(c, Distance)]
-    bodies = listed(bodies, (RigidBody, Beam), "bodies", "give a list of RigidBody or Beam")
+    bodies = _all_of("bodies", bodies)
     if not bodies:
         raise ValueError("bodies is empty, []; give at least one body")
-    forces = listed(forces, AbstractForce, "forces", "give a list of Gravity, Spring and their like")
-    return bodies, joints, forces, constraints
+    return bodies, joints, _all_of("forces", forces), constraints
+
+
+def _all_of(argument: str, entries: Any) -> list[Any]:
+    """List the elements of an argument; those that belong into another one are told by name."""
+    kinds, remedy = ARGUMENTS[argument]
+    if isinstance(entries, ELEMENTS):
+        raise ValueError(f"{argument} is one element, {_named(entries)}; {remedy}")
+    entries = listed(entries, object, argument, remedy)
+    for entry in entries:
+        if isinstance(entry, ELEMENTS) and not isinstance(entry, kinds):
+            right = next(name for name, (kinds, _) in ARGUMENTS.items() if isinstance(entry, kinds))
+            raise ValueError(f"{_named(entry)} belongs in {right}=[...]; take it out of {argument}")
+    return listed(entries, kinds, argument, remedy)
+
+
+def _named(element: Any) -> str:
+    return getattr(element, "display_name", None) or f"{type(element).__name__} {element.name!r}"
 
 
 def _check_names(parts: Parts) -> dict[str, RigidBody]:
