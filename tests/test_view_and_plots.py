@@ -230,6 +230,29 @@ def test_reactions_that_are_not_unique_are_hatched(crank_slider):
     assert hatched.get_hatch() == "////"
 
 
+def test_the_reaction_of_a_drive_is_its_torque_or_force():
+    arm, load = lx.rod("arm", 1.0, 2.0), lx.point_mass("load", 3.0)
+    joints = [lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z"), lx.Prismatic("lift", lx.GROUND, load, "y")]
+    drives = [lx.Drive("motor", "hinge", speed=0.0), lx.Drive("winch", "lift", speed=0.0)]
+    mechanism = lx.Mechanism([arm, load], joints, [lx.Gravity([0.0, -9.81, 0.0])], drives)
+    here = lx.Solution.of_state(mechanism, lx.assemble(mechanism))
+    for name, label, value in (("motor", "torque [N m]", 9.81), ("winch", "force [N]", 3.0 * 9.81)):
+        (panel,) = lx.plot.reaction(here, name).axes
+        assert (panel.get_title(), panel.get_ylabel()) == (f"Reaction of drive {name!r}", label)
+        np.testing.assert_allclose(panel.lines[0].get_ydata(), [value], rtol=1e-12)
+        assert not panel.collections
+    np.testing.assert_allclose(here.reaction("hinge").moment, 0.0, atol=1e-12)  # as the motor bears it
+    twice = [*drives, lx.Coupling("brake", {"lift": 2.0})]
+    again = lx.Mechanism([arm, load], joints, mechanism.forces, twice)
+    (panel,) = lx.plot.reaction(lx.Solution.of_state(again, lx.assemble(mechanism)), "brake").axes
+    assert panel.get_ylabel() == "multiplier"
+    assert panel.collections[0].get_hatch() == "////"
+    with pytest.raises(
+        ValueError, match="unknown joint or constraint 'engine'; known: 'hinge', 'lift', 'motor', 'winch'"
+    ):
+        lx.plot.reaction(here, "engine")
+
+
 @pytest.mark.parametrize("name", ["bricard", "stewart"])
 def test_spatial_mechanisms_are_seen_from_a_corner(name):
     """No rod points at the eye."""

@@ -256,7 +256,7 @@ def test_unknown_names_in_accessors():
     found = lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0)
     with pytest.raises(ValueError, match="unknown body 'crank'; known: 'link'"):
         found.position("crank")
-    with pytest.raises(ValueError, match="unknown joint 'pin'; known: 'pivot'"):
+    with pytest.raises(ValueError, match="unknown joint or constraint 'pin'; known: 'pivot'"):
         found.reaction("pin")
     with pytest.raises(ValueError, match="body 'link' has no frame 'tip'"):
         found.position("link", at="tip")

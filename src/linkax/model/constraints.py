@@ -97,8 +97,8 @@ class Drive(LinearConstraint):
     """A joint's coordinate as a given function of time, or at constant speed.
 
     `Drive("motor", "bearing", speed=6.0, start=0.3)` turns `bearing` at 6 rad/s, from 0.3 rad at t = 0.
-    `Drive("motor", "bearing", lambda t: 0.3 * jnp.sin(t))` swings it. Its reaction is the driving torque [N m], or
-    force [N] on a slide, along the joint.
+    `Drive("motor", "bearing", lambda t: 0.3 * jnp.sin(t))` swings it. Its reaction, `solution.reaction("motor")`,
+    is the driving torque [N m], or force [N] on a slide, along the joint; that of the joint itself has no such part.
 
     **Arguments:**
 

@@ -7,14 +7,17 @@ cell. All raise `ValueError` for an unknown name, and for the solution of a batc
 
 import numpy as np
 
+from linkax.model.constraints import Drive
+from linkax.model.ropes import Rope
 from linkax.plot.figure import Figure
 from linkax.scenery.colours import BLUE, GREEN, INK, VERMILION, body_colour
 from linkax.scenery.scenery import reached
-from linkax.simulation.read.by_name import BodyPoint
+from linkax.simulation.read.by_name import BodyPoint, is_constraint
 from linkax.simulation.read.solution import Solution
 
 COMPONENT_COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
 NEGLIGIBLE = 1e-9  # size of a component, relative to the largest, up to which it is left out
+NOT_UNIQUE = "not unique"
 SMALLEST_VIOLATION = 1e-17  # drawn in place of zero, which has no logarithm
 
 
@@ -62,9 +65,21 @@ def reaction(solution: Solution, joint: str) -> Figure:
 
     Components that are zero are left out. Those are hatched that redundant constraints leave undetermined, see
     `Solution.reaction_unique`.
+
+    **Arguments:** `joint`: its name, or that of a constraint, of which this plots torque [N m] or force [N] (`Drive`),
+    tension [N] (`Rope`) or multiplier (`Coupling`).
     """
     solution = reached(solution)
     found, unique = solution.reaction(joint), solution.reaction_unique(joint)
+    if is_constraint(solution, joint):
+        constraint = solution.mechanism.constraints[solution.mechanism.topology.constraints.index(joint)]
+        figure, (panel,) = _panels(f"Reaction of {constraint.display_name}", 1)
+        panel.plot(solution.ts, found, color=BLUE)
+        panel.set_ylabel(_strength(solution.mechanism, constraint))
+        if np.any(undetermined := ~np.asarray(unique)):
+            _hatch(panel, solution.ts, np.asarray(found), undetermined, BLUE, NOT_UNIQUE)
+            panel.legend(frameon=False, fontsize="small", loc="upper right")
+        return figure
     child = solution.mechanism.joint(joint).child.body
     largest = [float(np.max(np.abs(np.asarray(part)), initial=0.0)) for part in found]
     drawn = [("force [N]", found.force, unique.force), ("moment [N m]", found.moment, unique.moment)]
@@ -73,10 +88,19 @@ def reaction(solution: Solution, joint: str) -> Figure:
     for panel, (label, values, known) in zip(panels, drawn, strict=True):
         shown = _present(values)
         _draw_components(panel, solution.ts, values, shown)
-        _hatch(panel, solution.ts, np.asarray(values), ~np.asarray(known), shown)
+        _hatch_components(panel, solution.ts, np.asarray(values), ~np.asarray(known), shown)
         panel.set_ylabel(label)
         panel.legend(frameon=False, fontsize="small", loc="upper right")
     return figure
+
+
+def _strength(mechanism, constraint):
+    """What the reaction of a constraint is, with its unit."""
+    if isinstance(constraint, Drive):
+        (along,) = constraint.terms
+        unit = mechanism.joint(along.joint).speed_units[along.index or 0]
+        return "torque [N m]" if unit == "rad" else "force [N]"
+    return "tension [N]" if isinstance(constraint, Rope) else "multiplier"
 
 
 def violations(solution: Solution) -> Figure:
@@ -159,14 +183,19 @@ def _draw_components(panel, times, values, names):
             panel.plot(times, np.asarray(values)[:, index], color=colour, label=name)
 
 
-def _hatch(panel, times, values, undetermined, names):
+def _hatch_components(panel, times, values, undetermined, names):
     """Hatch the components that are not unique, down to zero."""
-    label = "not unique"
+    label = NOT_UNIQUE
     for index, (name, colour) in enumerate(COMPONENT_COLOURS.items()):
         if name in names and np.any(undetermined[:, index]):
-            style = {"facecolor": "none", "edgecolor": colour, "alpha": 0.35, "hatch": "////", "linewidth": 0.0}
-            panel.fill_between(times, values[:, index], where=undetermined[:, index], label=label, **style)
+            _hatch(panel, times, values[:, index], undetermined[:, index], colour, label)
             label = None
+
+
+def _hatch(panel, times, values, where, colour, label):
+    """Hatch a line down to zero at some times."""
+    style = {"facecolor": "none", "edgecolor": colour, "alpha": 0.35, "hatch": "////", "linewidth": 0.0}
+    panel.fill_between(times, values, where=where, label=label, **style)
 
 
 def _along(names):

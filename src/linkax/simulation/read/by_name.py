@@ -82,12 +82,12 @@ def of_joint(function: Callable[..., Any], solution: Solution, name: str) -> Flo
 def reaction_of(function: Callable[..., Any], solution: Solution, name: str, on: Side, axes: Axes) -> Reaction:
     """Read a function of reactions for one joint.
 
-    **Raises:** `ValueError` for an unknown joint, side or axes.
+    **Raises:** `ValueError` for an unknown name, side or axes.
     """
     for what, entry, choices in (("on", on, get_args(Side)), ("axes", axes, get_args(Axes))):
         one_of(entry, choices, what)
-    solution.mechanism.joint(name)
-    index = solution.mechanism.topology.joints.index(name)
+    topology = solution.mechanism.topology
+    index = find(name, (*topology.joints, *topology.constraints), "joint or constraint")
     force, moment = read_in_motion(function, solution, on, axes)
     return Reaction(force[..., index, :], moment[..., index, :])
 

@@ -228,7 +228,8 @@ class Solution(eqx.Module):
 
         **Returns:** a `Reaction` of forces [N] and moments [N m], (n_t, 3) each. For a drive, its
         torque [N m] or force [N] along the joint, (n_t,); for a coupling, μ: it acts along each
-        joint with coefficient × μ.
+        joint with coefficient × μ. A driven joint's own moment, or force, has no component along the drive: that is
+        the reaction of the drive.
 
         With redundant constraints, reactions are not unique: these are of minimum norm, and
         `reaction_unique` tells which components can be relied upon. Of a run through a singular configuration they
