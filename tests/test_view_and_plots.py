@@ -3,13 +3,16 @@
 import dataclasses
 import io
 import os
+import re
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import diffrax
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 import linkax as lx
@@ -186,9 +189,23 @@ def test_bad_requests(crank_slider):
         solution.view(reactions=["hinge"])
     with pytest.raises(ValueError, match="unknown body 'wheel'"):
         solution.view(points={"rim": ("wheel", None)})
+    form = "give {name: (body, at)}"
+    refused(lambda: solution.view(points=["rod"]), "points is ['rod']", form)
+    for entry in ([0.1, 0.2, 0.0], "rod", ("rod",), (0.3, "rod")):
+        refused(lambda entry=entry: solution.view(points={"P": entry}), f"points: 'P' is {entry!r}", form)
     batch = dataclasses.replace(solution, ts=np.stack([solution.ts] * 2))
     with pytest.raises(ValueError, match=r"is a batch of shape \(2,\); draw one of its members"):
         batch.view()
+
+
+@pytest.mark.parametrize("opens", [True, False])
+def test_where_no_browser_opens_the_path_is_told(opens, crank_slider, monkeypatch, capsys):
+    monkeypatch.setattr("webbrowser.open", lambda _: opens)
+    crank_slider[0].view().show()
+    told = capsys.readouterr().err
+    assert opens == (told == "")
+    if not opens:
+        assert "showMechanism" in Path(re.search(r"the page is (.+)", told)[1]).read_text()
 
 
 def labels(figure):

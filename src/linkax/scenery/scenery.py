@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +16,7 @@ from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.mechanism import Mechanism
+from linkax.model.numbers import require_type
 from linkax.model.point_forces import Damper, Spring
 from linkax.model.ropes import ElasticRope, Rope
 from linkax.scenery.camera import Camera, camera_for
@@ -84,9 +85,9 @@ def scenery_of(solution: Solution, points: Points, times: Float[np.ndarray, " n_
 
     **Arguments:** `points`: to trace.
 
-    **Raises:** `ValueError` for the solution of a batch, and one that holds no state.
+    **Raises:** `ValueError` for the solution of a batch, one that holds no state, and points of another form.
     """
-    saved = reached(solution)
+    saved, points = reached(solution), checked_points(points)
     shown = saved if times is None else _between(saved, times)
     mechanism, moments = saved.mechanism, np.asarray(shown.ts)
     poses = {name: (np.asarray(origin), np.asarray(axes)) for name, (origin, axes) in shown.poses().items()}
@@ -98,6 +99,15 @@ def scenery_of(solution: Solution, points: Points, times: Float[np.ndarray, " n_
     curves = {name: way(fine) for name, way in ways.items()}
     camera = camera_for(mechanism, _everything(poses, outlines, traced))
     return Scenery(mechanism, moments, poses, outlines, traced, curves, camera)
+
+
+def checked_points(points: Any) -> Points:
+    """Check that points are {name: (body, at)}."""
+    form = "give {name: (body, at)}, such as {'P': ('coupler', 'tip')} or {'P': ('coupler', [0.4, 0.2, 0.0])}"
+    for name, entry in require_type(points, Mapping, "points", form).items():
+        if not (isinstance(entry, tuple | list) and len(entry) == 2 and isinstance(entry[0], str)):
+            raise ValueError(f"points: {name!r} is {entry!r}; {form}")
+    return points
 
 
 def reached(solution: Solution) -> Solution:

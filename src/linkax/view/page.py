@@ -5,6 +5,7 @@ import gzip
 import html
 import json
 import os
+import sys
 import tempfile
 import webbrowser
 from importlib.resources import files
@@ -42,9 +43,10 @@ class View:
         return Path(path)
 
     def show(self) -> None:
-        """Open the page in the browser."""
+        """Open the page in the browser; where there is none, tell the path of the page."""
         path = self.save(Path(tempfile.mkdtemp(prefix="linkax-")) / "view.html")
-        webbrowser.open(path.as_uri())
+        if not webbrowser.open(path.as_uri()):
+            print(f"no browser opens from here; the page is {path}", file=sys.stderr)
 
     def __repr__(self) -> str:
         return f"View of {len(self.html) / 1e6:.1f} MB: .show() opens it in the browser, .save(path) writes it"
