@@ -247,6 +247,43 @@ def test_reactions_that_are_not_unique_are_hatched(crank_slider):
     assert hatched.get_hatch() == "////"
 
 
+def test_paths_are_drawn_in_the_plane_to_scale(crank_slider):
+    solution, _ = crank_slider
+    (panel,) = lx.plot.path(solution, {"pin": ("crank", "tip"), "wrist": ("slider", None)}).axes
+    assert (panel.get_xlabel(), panel.get_ylabel(), panel.get_aspect()) == ("x [m]", "y [m]", 1.0)
+    paths = {line.get_label(): line.get_xydata() for line in panel.lines}
+    pin = np.asarray(solution.position("crank", "tip"))
+    np.testing.assert_allclose(paths["pin"][[0, -1]], pin[[0, -1], :2], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(paths["pin"], axis=1), np.linalg.norm(pin[0]), rtol=1e-3)  # a circle
+    np.testing.assert_allclose(paths["wrist"][:, 1], 0.0, atol=1e-12)  # a line along x
+    assert panel.get_title() == "Path of pin, wrist"
+    refused(lambda: lx.plot.path(solution, {}), "points is {}", "at least one")
+    refused(lambda: lx.plot.path(solution, ("crank", "tip")), "points is ('crank', 'tip')", "{name: (body, at)}")
+
+
+def test_paths_in_space_are_seen_from_a_corner():
+    mechanism, state, points = scene("bricard")
+    solution = swaying(mechanism, state)
+    (panel,) = lx.plot.path(solution, points).axes
+    (name, point), *_ = points.items()
+    seen = scenery_of(solution, points).camera.seen(np.asarray(solution.position(*point)))
+    (path,) = (line.get_xydata() for line in panel.lines if line.get_label() == name)
+    np.testing.assert_allclose(path[[0, -1]], seen[[0, -1]], atol=1e-12)
+    assert not panel.axison
+
+
+@pytest.mark.parametrize(
+    ("at", "name", "title"),
+    [
+        (None, None, "Motion of slider's centre of mass along x"),
+        ([0.1, 0.2, 0.0], None, "Motion of slider at (0.1, 0.2, 0) m along x"),
+        (None, "pin", "Motion of pin along x"),
+    ],
+)
+def test_titles_of_motions_tell_the_point(at, name, title, crank_slider):
+    assert lx.plot.motion(crank_slider[0], "slider", at, name).axes[0].get_title() == title
+
+
 def test_the_reaction_of_a_drive_is_its_torque_or_force():
     arm, load = lx.rod("arm", 1.0, 2.0), lx.point_mass("load", 3.0)
     joints = [lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z"), lx.Prismatic("lift", lx.GROUND, load, "y")]

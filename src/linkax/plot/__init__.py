@@ -8,3 +8,4 @@ from linkax.plot.histories import motion as motion
 from linkax.plot.histories import reaction as reaction
 from linkax.plot.histories import singularity as singularity
 from linkax.plot.histories import violations as violations
+from linkax.plot.paths import path as path

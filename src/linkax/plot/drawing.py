@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from linkax.model.bodies import GROUND_NAME
+from linkax.plot.figure import Figure
 from linkax.scenery.colours import FAINT, INK, body_colour
 from linkax.scenery.scenery import Scenery, is_concentrated, is_hinge, is_slide, moving_frame, spans
 

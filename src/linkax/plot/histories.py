@@ -14,6 +14,7 @@ from linkax.scenery.colours import BLUE, GREEN, INK, VERMILION, body_colour
 from linkax.scenery.scenery import reached
 from linkax.simulation.read.by_name import BodyPoint, is_constraint
 from linkax.simulation.read.solution import Solution
+from linkax.tables import numbers
 
 COMPONENT_COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
 NEGLIGIBLE = 1e-9  # size of a component, relative to the largest, up to which it is left out
@@ -26,8 +27,8 @@ def motion(solution: Solution, body: str, at: BodyPoint = None, name: str | None
 
     Components in which the point does not move are left out.
 
-    **Arguments:** `body`, `at`: the point, see `Solution.position`. `name`: of the point, in the title; by default the
-    body's.
+    **Arguments:** `body`, `at`: the point, see `Solution.position`. `name`: of the point, in the title; by default
+    that says the body and where on it. `linkax.plot.path` plots it in space.
     """
     solution = reached(solution)
     histories = {
@@ -36,7 +37,7 @@ def motion(solution: Solution, body: str, at: BodyPoint = None, name: str | None
         "acceleration [m/s²]": solution.acceleration(body, at),
     }
     shown = _present(histories["velocity [m/s]"])
-    figure, panels = _panels(f"Motion of {name or body}{_along(shown)}", 3)
+    figure, panels = _panels(f"Motion of {name or _point(body, at)}{_along(shown)}", 3)
     for panel, (label, values) in zip(panels, histories.items(), strict=True):
         _draw_components(panel, solution.ts, values, shown)
         panel.set_ylabel(label)
@@ -196,6 +197,13 @@ def _hatch(panel, times, values, where, colour, label):
     """Hatch a line down to zero at some times."""
     style = {"facecolor": "none", "edgecolor": colour, "alpha": 0.35, "hatch": "////", "linewidth": 0.0}
     panel.fill_between(times, values, where=where, label=label, **style)
+
+
+def _point(body, at):
+    """Words for a point of a body."""
+    if at is None:
+        return f"{body}'s centre of mass"
+    return f"{body}.{at}" if isinstance(at, str) else f"{body} at {numbers(np.asarray(at), 'm', np.ndim(at))}"
 
 
 def _along(names):
