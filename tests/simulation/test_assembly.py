@@ -103,7 +103,7 @@ def test_what_a_drive_asks_may_be_given_too():
 
 
 def test_unknown_names_and_wrong_numbers():
-    with pytest.raises(ValueError, match="unknown joint 'pin'; known"):
+    with pytest.raises(ValueError, match=r"unknown joint or body 'pin'.*; known joints: 'bearing', "):
         lx.assemble(crank_slider(), {"pin": 1.0})
     with pytest.raises(ValueError, match="position of joint 'bearing' is"):
         lx.assemble(crank_slider(), {"bearing": float("nan")})

@@ -88,6 +88,11 @@ def test_what_is_wrong_is_named():
     mechanism = four_bar()
     refused(lambda: lx.assemble(mechanism, guess={"rocker.top": [0.0, 0.0, 0.0]}), "'rocker'", "'top'", "'tip'")
     refused(lambda: lx.assemble(mechanism, guess={"lever": lx.Pose([0.0, 0.0, 0.0])}), "'lever'", "'rocker'")
+    for misspelt, meant in (("roker.tip", "rocker.tip"), ("rocker_tip", "rocker.tip"), ("rokcer", "rocker")):
+        asked = [{"guess": {misspelt: [0.0, 1.0, 0.0]}}, {"positions": {misspelt: lx.Pose([0.0, 1.0, 0.0])}}]
+        for given in [*asked, {"speeds": {misspelt: [0.0, 1.0, 0.0]}}]:
+            told = f"unknown joint or body {misspelt!r} (did you mean {meant!r}?)"
+            refused(lambda given=given: lx.assemble(mechanism, **given), told, *mechanism.topology.joints)
     refused(lambda: lx.assemble(mechanism, {"rocker.tip": [0.0, 1.0]}), "'rocker.tip'", "(2,)")
     refused(lambda: lx.assemble(mechanism, {"rocker": lx.Velocity([0.0, 1.0, 0.0])}), "'rocker'", "Pose")
     refused(lambda: lx.assemble(mechanism, guess={"rocker": lx.Pose([0.0, 1.0, 0.0], 2.0 * np.eye(3))}), "'rocker'")

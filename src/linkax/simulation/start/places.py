@@ -5,6 +5,7 @@ A `Free` joint that is cut constrains nothing, and its coordinates and speeds ar
 
 import copy
 from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
 from typing import Any
 
 import jax
@@ -58,8 +59,11 @@ class Places:
         return found
 
     def _replaced(self, given, what, kind):
-        require_type({} if given is None else given, Mapping, what, "give {joint: number, ...}")
-        if given is None or not any(map(self._is_place, given, given.values())):
+        given = require_type({} if given is None else given, Mapping, what, "give {joint: number, ...}")
+        for key, entry in given.items():
+            if isinstance(key, str) and key not in self.mechanism.topology.joints and not self._is_place(key, entry):
+                raise ValueError(self._unknown(key, what))
+        if not any(map(self._is_place, given, given.values())):
             return given
         found = {}
         for key, entry in given.items():
@@ -111,8 +115,17 @@ class Places:
                     f"{body.sections[0]!r}"
                 )
             return body.reference if label is None else body.at(label)
-        known = ", ".join(map(repr, self.mechanism.topology.bodies))
-        raise ValueError(f"{what} of unknown body {key!r}; known: {known}, and their frames as 'body.frame'")
+        raise ValueError(self._unknown(key, what))
+
+    def _unknown(self, key, what) -> str:
+        joints, bodies = self.mechanism.topology.joints, self.mechanism.bodies
+        places = [name for body in bodies for name in (body.name, *(f"{body.name}.{label}" for label in body.frames))]
+        meant = "".join(f" (did you mean {name!r}?)" for name in get_close_matches(str(key), [*joints, *places], 1))
+        listed = lambda names: ", ".join(map(repr, names))
+        return (
+            f"{what} of unknown joint or body {key!r}{meant}; known joints: {listed(joints)}; "
+            f"known bodies, and frames on them: {listed(places)}"
+        )
 
 
 def _parts(key: str) -> Iterator[tuple[str, str | None]]:
