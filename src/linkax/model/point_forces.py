@@ -56,7 +56,8 @@ class Spring(_BetweenPoints):
     Where the points meet there is no direction, and it does not push.
 
     **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`;
-    `stiffness` [N/m]; `free_length` [m], zero or more; `name`, see `linkax.AbstractForce`.
+    `stiffness` [N/m]; `free_length` [m], at which it has no force, zero or more; left out, it is zero, and the spring
+    pulls at any distance; `name`, see `linkax.AbstractForce`.
     """
 
     stiffness: Scalar
