@@ -41,6 +41,31 @@ def test_struts_of_lengths_of_both_signs():
         lx.assemble(mechanism)
 
 
+@pytest.mark.parametrize("off", [0.0, 0.005, 0.05])
+def test_rods_that_are_drawn_apart(off):
+    """By more than a hundredth of the size, of joints that join points, where no guess says where they are."""
+    crank = lx.rod_between("crank", [0.0, 0.0, 0.0], [0.0, 0.4, 0.0], 1.0)
+    coupler = lx.rod_between("coupler", [0.0, 0.4, 0.0], [1.0, 0.9, 0.0], 1.0)
+    rocker = lx.rod_between("rocker", [1.0, 0.0, 0.0], [1.0, 0.9 + off, 0.0], 1.0)
+    block = lx.point_mass("block", 1.0).placed([3.0, 0.0, 0.0])
+    joints = [
+        lx.Revolute("motor", lx.GROUND, crank.at("base"), axis="z"),
+        lx.Revolute("crank_pin", crank.at("tip"), coupler.at("base"), axis="z"),
+        lx.Revolute("rocker_pin", coupler.at("tip"), rocker.at("tip"), axis="z"),
+        lx.Revolute("bearing", lx.GROUND.at([1.0, 0.0, 0.0]), rocker.at("base"), axis="z"),
+        lx.Prismatic("slide", lx.GROUND, block, axis="x"),  # whose length may be any
+    ]
+    mechanism = lx.Mechanism([crank, coupler, rocker, block], joints)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        state = lx.assemble(mechanism, {"motor": 0.0})
+        lx.assemble(mechanism, {"motor": 0.0}, guess={"rocker.tip": [1.0, 0.9, 0.0]})
+    np.testing.assert_allclose(state.q[0], 0.0, atol=1e-12)
+    assert len(told) == (off > 0.01)
+    if told:
+        assert re.search(r"'rocker_pin' joins points that are drawn 0\.05 m apart, .*draw them", str(told[0].message))
+
+
 def test_a_spin_that_nothing_decides():
     """Of a coupler between two balls: asked for, it is as asked."""
     mechanism = coupler_between_balls()

@@ -90,15 +90,15 @@ def assemble(
     neither held nor decided by the loops has the derivative of the nearest to the guess, as if the guess closed the
     loops. A guess of cut joints or places has no derivative.
 
-    **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop
-    cannot be closed, with what is held, by drives too; or the joints whose motion branches where the speeds lie on no
-    branch;
-    `ValueError` for an unknown joint or a wrong number. Inside JAX transformations nothing is
-    raised: the speeds are infinite then, and `linkax.simulate` says so in its result.
+    **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop cannot be closed, with
+    what is held, by drives too; or the joints whose motion branches where the speeds lie on no branch; `ValueError` for
+    an unknown joint or a wrong number. Inside JAX transformations nothing is raised: the speeds are infinite then, and
+    `linkax.simulate` says so in its result.
     Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain; of speeds that fit several
     branches; of angles beyond one and a half turns, which may be degrees, but of joints whose turns a force or a
-    constraint counts; where no guess is given, of slides between moving bodies with lengths of both signs; and of a
-    body between two balls whose spin nothing decides. `linkax.assemblies` finds what other assemblies there are.
+    constraint counts; where no guess is given, of slides between moving bodies with lengths of both signs, and of
+    joints between points that a model drawn in the world (`RigidBody.placed`) has in two places; and of a body between
+    two balls whose spin nothing decides. `linkax.assemblies` finds what other assemblies there are.
     """
     check_mechanism(mechanism)
     t = checked_time(t, "t")

@@ -5,24 +5,30 @@ from collections.abc import Iterator
 import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
+from linkax.model.joints.bending import OnBeam
+from linkax.model.joints.distance import Distance
 from linkax.model.joints.prismatic import Prismatic
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.places import SUFFIX
 from linkax.simulation.start.state import State
+from linkax.xla.tracing import all_concrete
 
 TURN = 2.0 * np.pi
+DRAWN_APART = 0.01  # of the size of what is drawn
 MOST_TURNS = 1.5  # that are given for an angle; ten degrees are more radians than this
 
 
 def doubts(
     mechanism: Mechanism, positions: JointValues, guess: JointValues, speeds: JointValues, state: State
 ) -> Iterator[str]:
-    """Tell of angles that may be degrees, lengths of struts of both signs, and spins that nothing decides."""
+    """Tell of angles that may be degrees, lengths of struts of both signs, joints that are drawn apart, and spins that
+    nothing decides."""
     yield from _many_turns(mechanism, positions, "position")
     yield from _many_turns(mechanism, guess, "guess")
     if not guess.groups:
         yield from _short_struts(mechanism, positions, state)
+        yield from _drawn_apart(mechanism)
     yield from _idle_spins(mechanism, speeds, state)
 
 
@@ -58,6 +64,30 @@ def _short_struts(mechanism, positions, state) -> Iterator[str]:
             f"slides between moving bodies have lengths below zero, {short}, and others above, and no guess was given; "
             "if these are struts, give a guess for them, or for the place of a body: guess={body: lx.Pose(position)}"
         )
+
+
+def _drawn_apart(mechanism) -> Iterator[str]:
+    """Of joints between points that coincide, where a model that is drawn in the world has them in two places."""
+    origins = {GROUND_NAME: np.zeros(3)} | {body.name: body.drawn_at for body in mechanism.bodies}
+    drawn = {}
+    for joint in mechanism.joints:
+        ends = [(origins[frame.body], frame.offset) for frame in (joint.parent, joint.child)]
+        if (
+            "m" in joint.speed_units
+            or isinstance(joint, Distance | OnBeam)
+            or any(origin is None for origin, _ in ends)
+        ):
+            continue
+        if all_concrete(ends):
+            drawn[joint.name] = np.array([origin + offset for origin, offset in ends])
+    size = np.max(np.ptp(np.array([*drawn.values()]).reshape(-1, 3), axis=0)) if drawn else 0.0
+    for name, (parent, child) in drawn.items():
+        if (apart := np.linalg.norm(parent - child)) > DRAWN_APART * size:
+            yield (
+                f"joint {name!r} joins points that are drawn {apart:.3g} m apart, at {parent.tolist()} and at "
+                f"{child.tolist()}, and no guess was given; draw them in one place, or give a guess where bodies are "
+                "not as drawn"
+            )
 
 
 def _idle_spins(mechanism, speeds, state) -> Iterator[str]:
