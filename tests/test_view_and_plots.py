@@ -1,5 +1,6 @@
 """The view, in a real browser, and the plots."""
 
+import base64
 import dataclasses
 import io
 import os
@@ -232,6 +233,18 @@ def test_plots_show_what_the_solution_says(crank_slider):
     batch = dataclasses.replace(solution, ts=np.stack([solution.ts] * 2))
     with pytest.raises(ValueError, match="draw one of its members"):
         lx.plot.energy(batch)
+
+
+def test_a_notebook_shows_the_animation_that_is_written(crank_slider, tmp_path):
+    solution, points = crank_slider
+    film = lx.plot.animate(solution, tmp_path / "film.gif", points, dpi=20)
+    (shown,) = re.fullmatch('<img src="data:image/gif;base64,(.*)">', film._repr_html_()).groups()
+    assert (tmp_path / "film.gif").read_bytes() == film.gif == base64.b64decode(shown)
+    with Image.open(io.BytesIO(film.gif)) as opened:
+        assert (opened.format, opened.is_animated) == ("GIF", True)
+    at_end = lx.Solution.of_state(solution.mechanism, solution.end)
+    with pytest.raises(ValueError, match="a solution of 1 times cannot be animated"):
+        lx.plot.animate(at_end)
 
 
 def test_reactions_that_are_not_unique_are_hatched(crank_slider):

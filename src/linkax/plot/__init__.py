@@ -1,5 +1,6 @@
 """Plot a motion against time, animate it, and compare formulations: `lx.plot.energy(solution)`."""
 
+from linkax.plot.animation import Animation as Animation
 from linkax.plot.animation import animate as animate
 from linkax.plot.comparison import comparison as comparison
 from linkax.plot.histories import energy as energy

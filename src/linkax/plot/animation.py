@@ -1,6 +1,9 @@
 """Animate a mechanism as a GIF."""
 
+import base64
+import io
 import os
+from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -15,8 +18,26 @@ MOST_FRAMES = 150
 LARGEST_TURN = 0.6  # of a joint between two frames, beyond which a wheel seems to turn the other way [rad]
 
 
-def animate(solution: Solution, path: str | os.PathLike, points: Points | None = None, dpi: int = 100) -> None:
-    """Write an animated GIF of a mechanism: in the plane of its motion, or from a corner where that is spatial.
+class Animation:
+    """An animated GIF, which a notebook shows as the value of a cell.
+
+    - `gif`: the file as bytes.
+    """
+
+    def __init__(self, gif: bytes) -> None:
+        self.gif = gif
+
+    def __repr__(self) -> str:
+        return f"Animation of {len(self.gif) / 1e6:.1f} MB: a notebook shows it, .gif has its bytes"
+
+    def _repr_html_(self) -> str:
+        return f'<img src="data:image/gif;base64,{base64.b64encode(self.gif).decode()}">'
+
+
+def animate(
+    solution: Solution, path: str | os.PathLike | None = None, points: Points | None = None, dpi: int = 100
+) -> Animation:
+    """Draw an animated GIF of a mechanism: in the plane of its motion, or from a corner where that is spatial.
 
     Bodies are drawn through their joints and named frames, slides as boxes on their guides, ground under its joints,
     springs, dampers, ropes and massless rods by their symbols, and point masses as discs. The GIF has at most
@@ -25,9 +46,11 @@ def animate(solution: Solution, path: str | os.PathLike, points: Points | None =
 
     **Arguments:**
 
-    - `path`: file to write, ending in `.gif`.
+    - `path`: file to write, ending in `.gif`; none by default.
     - `points`: {name: (body, at)} of points to label and trace, see `Solution.position`.
     - `dpi`: resolution in dots per inch.
+
+    **Returns:** an `Animation`, which a notebook shows.
 
     **Raises:** `ValueError` for a solution of fewer than two times, and for that of a batch.
     """
@@ -39,9 +62,12 @@ def animate(solution: Solution, path: str | os.PathLike, points: Points | None =
     frames = _filmed(figure, axes, actors, len(scenery.times))
     # One palette for all frames: colours do not flicker, and the file is small.
     frames = [frame.quantize(palette=frames[0].quantize(128), dither=Image.Dither.NONE) for frame in frames]
-    frames[0].save(
-        path, format="GIF", save_all=True, append_images=frames[1:], duration=1000 // FRAMES_PER_SECOND, loop=0
-    )
+    stream, duration = io.BytesIO(), 1000 // FRAMES_PER_SECOND
+    frames[0].save(stream, format="GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
+    animation = Animation(stream.getvalue())
+    if path is not None:
+        Path(path).write_bytes(animation.gif)
+    return animation
 
 
 def _filmed(figure, axes, actors, count) -> list[Image.Image]:
