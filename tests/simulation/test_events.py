@@ -61,6 +61,18 @@ def test_root_of_an_event_against_the_closed_form(adjoint, derivative):
     np.testing.assert_allclose(slopes, derivative(exact)(1.5), atol=1e-8)
 
 
+@pytest.mark.parametrize(("direction", "angle"), [(False, 0.5 * np.pi), (True, 1.5 * np.pi)])
+def test_direction_of_an_event(direction, angle):
+    """The cosine of an angle ½ T t² falls through zero at π/2, and rises through it at 3π/2."""
+
+    def cosine(t, state, mechanism):
+        return jnp.cos(lx.Solution.of_state(mechanism, state, t=t).joint("hinge")[0])
+
+    steps = {"dt0": 0.1, "stepsize_controller": diffrax.ConstantStepSize()}  # adaptive ones go over two zeros at once
+    found = rotor(1.5, t1=5.0, event=diffrax.Event(cosine, ROOT, direction), **steps)
+    np.testing.assert_allclose(found.t_end, np.sqrt(2.0 * angle / 1.5), atol=1e-9)
+
+
 @pytest.mark.slow
 @in_both_modes
 def test_root_of_an_event_in_a_loop(adjoint, derivative):

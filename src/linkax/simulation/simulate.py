@@ -60,9 +60,12 @@ def simulate(
     - `adjoint`: of diffrax. By default both modes work, over the steps that the run took, where the solver is an
       explicit Runge-Kutta method and states are saved, without event and dense output; elsewhere it is
       `RecursiveCheckpointAdjoint`, for reverse mode. `ForwardMode` serves forward mode alone.
-    - `event`: as in diffrax; condition functions get (t, state, mechanism). With a `root_finder` the run ends at the
-      event, and its end has derivatives (`RecursiveCheckpointAdjoint` backwards, `ForwardMode` forwards). Without one
-      it ends with the step in which the event occurs: derivatives of its end are not a number.
+    - `event`: as in diffrax; condition functions get (t, state, mechanism), with the state on the closed loops. Read it
+      by name: `lx.Solution.of_state(mechanism, state, t=t).joint("bearing")[0]`, or `.joint_speed("bearing")[0]`, or
+      `.position("crank", "tip")[0]`. The event occurs where a condition becomes true, or a number passes zero: upwards
+      with `direction=True`, downwards with `direction=False`, either way by default. With a `root_finder` the run ends
+      at the event, and its end has derivatives (`RecursiveCheckpointAdjoint` backwards, `ForwardMode` forwards).
+      Without one it ends with the step in which the event occurs: derivatives of its end are not a number.
     - `dtype`: floating-point type of the whole computation, default double precision.
     - `dt0`, `max_steps`, `progress_meter`: as in diffrax.
     - `optimise`: deprecated, and without effect: every run compiles as quickly as those without it did.
