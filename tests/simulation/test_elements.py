@@ -1,5 +1,7 @@
 """Forces, lengths and work of single elements, and accelerations of joints and bodies."""
 
+import pickle
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -77,7 +79,10 @@ def test_force_and_length_by_name_and_by_element(solution):
 @pytest.mark.parametrize(
     ("read", "told"),
     [
-        (lambda s: s.force("sprung"), "unknown force, constraint or Distance 'sprung'; known: 'Gravity', 'spring'"),
+        (
+            lambda s: s.force("sprung"),
+            r"unknown force, constraint or Distance 'sprung' \(did you mean 'spring'\?\); known: 'Gravity', 'spring'",
+        ),
         (lambda s: s.force("Gravity"), "Gravity does not say which force it has; define strength"),
         (lambda s: s.force(s.mechanism.forces[2]), "several elements .* give each a name"),
         (lambda s: s.length("JointTorque on 'axle'"), "JointTorque on 'axle' has no length"),
@@ -86,6 +91,33 @@ def test_force_and_length_by_name_and_by_element(solution):
 def test_what_has_no_force_or_length_is_refused(solution, read, told):
     with pytest.raises(ValueError, match=told):
         read(solution)
+
+
+@pytest.mark.parametrize(
+    ("read", "told"),
+    [
+        (lambda s: s.work()["slak"], r"element that does work 'slak' \(did you mean 'slack'\?\); known: .*, 'slack', "),
+        (lambda s: s.reactions()["mottor"], r"unknown joint 'mottor' \(did you mean 'motor'\?\); known: .*'axle'"),
+        (lambda s: s.poses()["bobb"], r"unknown body 'bobb' \(did you mean 'bob'\?\); known: .*'w'"),
+        (lambda s: s.mechanism.topology.coordinates["z"], "unknown joint in the tree 'z'; known: .*'x'"),
+        (lambda s: lx.mobility(s.mechanism, s.end).joint_equations["rodd"], "joint or constraint 'rodd' .* known: "),
+    ],
+)
+def test_readings_by_name_say_which_names_there_are(solution, read, told):
+    with pytest.raises(KeyError, match=told):
+        read(solution)
+
+
+def test_readings_by_name_pass_through_programs(solution):
+    """They are dictionaries to JAX and to pickle, too."""
+    work = solution.work()
+    twice = jax.jit(lambda work: jax.tree.map(lambda done: 2.0 * done, work))(work)
+    for copied in (twice, pickle.loads(pickle.dumps(work))):
+        assert list(copied) == list(work)
+        with pytest.raises(KeyError, match="did you mean 'slack'"):
+            copied["slak"]
+    np.testing.assert_array_equal(twice["drive"], 2.0 * work["drive"])
+    assert jax.tree_util.keystr(jax.tree.leaves_with_path(work)[-1][0]) == "['drive']"
 
 
 def test_names_of_forces_are_unique():

@@ -12,6 +12,7 @@ from linkax.linalg.least_multipliers import least_multipliers
 from linkax.linalg.saddle_inverse import singularity_distance
 from linkax.model.immobile_rows import is_planar
 from linkax.model.mechanism import Mechanism
+from linkax.model.names import ByName
 from linkax.model.numbers import require_type
 from linkax.model.topology import Topology
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
@@ -122,7 +123,7 @@ def joint_equations(topology: Topology) -> dict[str, int]:
         if isinstance(kind, type):
             plain = len(kind.locked_rotations) + len(kind.locked_translations)
             found[name] = plain + bool(kind.combined_rotations or kind.combined_translations)
-    return found | dict.fromkeys(topology.constraints, 1)
+    return ByName(found | dict.fromkeys(topology.constraints, 1), "joint or constraint")
 
 
 def _locking(topology: Topology) -> list[str]:

@@ -1,7 +1,36 @@
 """Names of elements: checked, and found among those that are known."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, TypeVar
+
+from jax.tree_util import DictKey, register_pytree_with_keys
+
+Entry = TypeVar("Entry")
+
+
+class UnknownName(KeyError):
+    """An error of a dictionary that prints its message as it is, which a `KeyError` quotes."""
+
+    __str__ = Exception.__str__
+
+
+class ByName(dict[str, Entry]):
+    """A dictionary by the names of elements, `what`, whose error for an unknown one lists those that are known."""
+
+    def __init__(self, entries: Mapping[str, Entry], what: str) -> None:
+        super().__init__(entries)
+        self.what = what
+
+    def __missing__(self, name: Any) -> Entry:
+        raise UnknownName(_unknown(name, tuple(self), self.what))
+
+
+register_pytree_with_keys(
+    ByName,
+    lambda found: ([(DictKey(name), entry) for name, entry in found.items()], (tuple(found), found.what)),
+    lambda names_what, entries: ByName(dict(zip(names_what[0], entries, strict=True)), names_what[1]),
+)
 
 
 def find(name: Any, names: Sequence[str], what: str) -> int:
@@ -10,8 +39,14 @@ def find(name: Any, names: Sequence[str], what: str) -> int:
     **Raises:** `ValueError` that lists the known names.
     """
     if not isinstance(name, str) or name not in names:
-        raise ValueError(f"unknown {what} {name!r}; known: {', '.join(map(repr, names)) or 'none'}")
+        raise ValueError(_unknown(name, names, what))
     return names.index(name)
+
+
+def _unknown(name, names, what) -> str:
+    close = get_close_matches(name, names, 1) if isinstance(name, str) else []
+    meant = "".join(f" (did you mean {other!r}?)" for other in close)
+    return f"unknown {what} {name!r}{meant}; known: {', '.join(map(repr, names)) or 'none'}"
 
 
 def optional_name(name: Any, kind: str) -> str | None:

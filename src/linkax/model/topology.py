@@ -9,7 +9,7 @@ import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
-from linkax.model.names import find
+from linkax.model.names import ByName, find
 from linkax.model.terms import Term
 
 GROUND_INDEX = -1
@@ -133,7 +133,7 @@ class Topology:
         for name, kind in zip(self.joints[: self.num_bodies], self.joint_types, strict=False):
             slices[name] = slice(start, start + count(kind))
             start = slices[name].stop
-        return slices
+        return ByName(slices, "joint in the tree")
 
     def column(self, term: Term) -> int:
         """Find the index in v of the speed of a term; its joint must be in the tree."""

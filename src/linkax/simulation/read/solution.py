@@ -16,6 +16,7 @@ from linkax.model.beams import Beam
 from linkax.model.elements import AbstractElement
 from linkax.model.joints.distance import Distance
 from linkax.model.mechanism import Mechanism
+from linkax.model.names import ByName
 from linkax.model.numbers import Number, number, require
 from linkax.model.poses import Pose
 from linkax.simulation.explain.error_estimate import refined_run
@@ -196,7 +197,7 @@ class Solution(eqx.Module):
         """Reference frames of all bodies by name, of a beam those of its sections: what an animation needs."""
         origin, axes = read(Observables.poses, self)
         names = enumerate(self.mechanism.topology.bodies)
-        return {name: Pose(origin[..., index, :], axes[..., index, :, :]) for index, name in names}
+        return ByName({name: Pose(origin[..., index, :], axes[..., index, :, :]) for index, name in names}, "body")
 
     def joint(self, name: str) -> Float[Array, "..."]:
         """Coordinate of a joint, in the tree or cut [rad or m]; (n_t, n) where it has several."""
@@ -254,7 +255,7 @@ class Solution(eqx.Module):
         """The reactions of all joints on their children, in ground axes, by name."""
         force, moment = read_in_motion(Observables.reactions, self, "child", "ground")
         names = enumerate(self.mechanism.topology.joints)
-        return {name: Reaction(force[..., index, :], moment[..., index, :]) for index, name in names}
+        return ByName({name: Reaction(force[..., index, :], moment[..., index, :]) for index, name in names}, "joint")
 
     def energy(self) -> Float[Array, "*batch n_t"]:
         """Kinetic plus potential energy [J]."""

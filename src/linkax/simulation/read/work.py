@@ -1,6 +1,7 @@
 """Work of force elements and drives over a motion, between its saved times too."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.equations.coordinates import rates, speeds
+from linkax.model.names import ByName
 from linkax.model.topology import Topology
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables, do_work
@@ -25,14 +27,13 @@ def work(solution: Solution) -> dict[str, Float[Array, "*batch n_t"]]:
     mechanism, (forces, drives) = solution.mechanism, do_work(solution.mechanism)
     names = [mechanism.force_names[index] for index in forces]
     names += [mechanism.topology.constraints[index] for index in drives]
-    if not names:
-        return {}
-    if solution.ts.shape[-1] == 1:
-        return {name: jnp.zeros_like(solution.ts) for name in names}
-    between = _between(solution)
-    powers = [read(Observables.powers_of_forces, between)] if forces else []
-    powers += [read_in_motion(Observables.powers_of_drives, between)] if drives else []
-    return dict(zip(names, _integrals(solution.ts, powers), strict=True))
+    works: Any = [jnp.zeros_like(solution.ts) for _ in names]
+    if names and solution.ts.shape[-1] > 1:
+        between = _between(solution)
+        powers = [read(Observables.powers_of_forces, between)] if forces else []
+        powers += [read_in_motion(Observables.powers_of_drives, between)] if drives else []
+        works = _integrals(solution.ts, powers)
+    return ByName(dict(zip(names, works, strict=True)), "element that does work")
 
 
 def _between(solution):
