@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import diffrax
@@ -20,6 +21,7 @@ from linkax.straight_line.known import flat_with_known
 from linkax.xla import kept_programs, program_cache
 from linkax.xla.descriptions import Undescribed, description
 from linkax.xla.program import Program
+from linkax.xla.users_line import warn
 
 SOURCE = Path(lx.__file__).parents[1]
 SETTINGS = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "EQX_ON_ERROR")
@@ -187,12 +189,22 @@ def test_the_default_folder_is_the_users(tmp_path, monkeypatch):
 def test_what_cannot_be_kept_is_told():
     program_cache._warn.cache_clear()
     program_cache._note(program_cache.ASKED)
-    with pytest.warns(UserWarning, match="keeps none that calls back to Python"):
+    with pytest.warns(UserWarning, match="keeps none that calls back to Python") as told:
         program_cache._tell(program_cache.COMPILING, 3.0)
+    assert told[0].filename == __file__
     for event in program_cache.FOUND_OR_KEPT:
         program_cache._note(program_cache.ASKED)
         program_cache._note(event)
         program_cache._tell(program_cache.COMPILING, 3.0)
+
+
+def test_warnings_point_to_the_users_line():
+    """From below other libraries, and from a thread of linkax while the main thread waits."""
+    with pytest.warns(DeprecationWarning, match="rank_tolerance") as below:
+        lx.Accuracy(rank_tolerance=1e-9)
+    with ThreadPoolExecutor() as threads, pytest.warns(UserWarning, match="of a thread") as in_thread:
+        threads.submit(warn, "of a thread").result()
+    assert [told.filename for told in (*below, *in_thread)] == [__file__, __file__]
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path):

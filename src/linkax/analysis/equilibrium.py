@@ -1,6 +1,5 @@
 """Find an equilibrium, at rest or in steady motion, by a search downhill on the tangent space of the loops."""
 
-import warnings
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -28,6 +27,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, evaluate_now
+from linkax.xla.users_line import warn
 
 BALANCED_STEP = 1e-8  # last step above which the search has failed [rad, lengths of the mechanism]
 
@@ -119,7 +119,7 @@ def equilibrium(mechanism: Mechanism, state: State, *, t: ArrayLike = 0.0) -> St
     if ending.circulatory:
         remedy = "see the eigenvalues of linkax.linearise there"
         message = f"the equilibrium may be unstable: some of the forces have no potential; {remedy}"
-        warnings.warn(message, StabilityWarning, stacklevel=2)
+        warn(message, StabilityWarning)
     return reached
 
 

@@ -11,6 +11,7 @@ import jax
 import linkax as lx
 from linkax.cli.compare import run_compare
 from linkax.cli.simulate import run_simulate
+from linkax.xla.users_line import warn
 
 COMMANDS = {"simulate": run_simulate, "compare": run_compare}
 
@@ -40,4 +41,4 @@ def _cache_programs():
         try:
             lx.cache_programs()
         except ValueError as error:
-            warnings.warn(f"{error} by JAX_COMPILATION_CACHE_DIR", stacklevel=2)
+            warn(f"{error} by JAX_COMPILATION_CACHE_DIR")

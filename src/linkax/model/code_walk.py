@@ -3,20 +3,19 @@
 import abc
 import builtins
 import functools
-import os
 import sys
-import sysconfig
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dis import get_instructions
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from linkax.xla.users_line import LIBRARIES
 
 Maker = Callable[[Iterator[Any]], Any]  # makes a value again from an iterator of its numbers
 
@@ -48,11 +47,6 @@ _DYNAMIC |= {"attrgetter", "methodcaller", "asdict", "astuple", "fields", "copy"
 _UNCALLED = {"__init__", "__new__", "__post_init__", "__init_subclass__", "__setattr__", "__repr__", "__str__"}
 _UNCALLED |= {"__eq__", "__hash__"}
 _MOST_PARTS = 10_000
-_LIBRARIES = tuple(
-    {os.fspath(Path(path).parent) + os.sep for path in (os.__file__, Path(jax.__file__).parent, np.__path__[0])}
-    | {sysconfig.get_path("purelib") + os.sep, sysconfig.get_path("platlib") + os.sep}
-    | {os.fspath(Path(__file__).parents[1]) + os.sep}
-)
 
 
 def _is_library(value: Any) -> bool:
@@ -64,7 +58,7 @@ def _is_library(value: Any) -> bool:
         path = getattr(module, "__file__", None) or ""
         if getattr(module, "__name__", None) in sys.builtin_module_names:
             return True
-    return path.startswith((*_LIBRARIES, "<frozen"))
+    return path.startswith((*LIBRARIES, "<frozen"))
 
 
 def _is_pytree(value: Any) -> bool:

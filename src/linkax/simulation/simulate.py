@@ -1,6 +1,5 @@
 """Simulation: from a mechanism and a state to a motion in time."""
 
-import warnings
 from typing import Any
 
 import diffrax
@@ -17,6 +16,7 @@ from linkax.simulation.integrate.run import DEFAULT_FORMULATION, DEFAULT_MAX_STE
 from linkax.simulation.read.solution import Solution
 from linkax.simulation.start.state import State
 from linkax.xla.tracing import all_concrete
+from linkax.xla.users_line import warn
 
 
 def simulate(
@@ -85,7 +85,7 @@ def simulate(
     require_bool(throw, "throw")
     if optimise is not None:
         require_bool(optimise, "optimise")
-        warnings.warn("optimise has no effect any more; leave it out", DeprecationWarning, stacklevel=2)
+        warn("optimise has no effect any more; leave it out", DeprecationWarning)
     run = Run.of(
         mechanism,
         state,
@@ -110,7 +110,7 @@ def simulate(
             if throw:
                 raise _failure(solution)
         elif (found := remark_name(remark(solution))) != "none":
-            warnings.warn(in_words(solution, found).lstrip(), WARNINGS[found], stacklevel=2)
+            warn(in_words(solution, found).lstrip(), WARNINGS[found])
     return solution
 
 

@@ -1,6 +1,5 @@
 """`straight_line`: a function of arrays as a straight line, with derivatives in both modes, and batches over lanes."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property, lru_cache, partial, wraps
 from typing import Any, TypeVar
@@ -21,6 +20,7 @@ from linkax.straight_line.known import patterns_of
 from linkax.straight_line.program import Pattern, Program, straighten
 from linkax.xla.flags import makes_kernels_of_loops
 from linkax.xla.tracing import all_concrete, evaluate_now
+from linkax.xla.users_line import warn
 
 Output = TypeVar("Output")
 
@@ -73,11 +73,10 @@ def computes_kernels() -> bool:
     found, expected = evaluate_now(program, *given), (np.sin(given[0]) * given[1] - given[0], given[0] > given[1])
     right = all(np.allclose(a, b, rtol=1e-6) for a, b in zip(found, expected, strict=True))
     if not right:
-        warnings.warn(
+        warn(
             f"runs take several times as long as they could: jaxlib {jaxlib.__version__} does not compute what "
             "linkax.straight_line asks of it; install another jaxlib",
             RuntimeWarning,
-            stacklevel=2,
         )
     return right
 

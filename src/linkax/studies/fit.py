@@ -1,7 +1,6 @@
 """Fit parameters to measurements, by gradients, and estimate their uncertainty."""
 
 import os
-import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,7 @@ from linkax.studies.free_parameters import FreeParameters
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.parameters import as_arrays
 from linkax.studies.uncertainty import DEPENDENT, uncertainty
+from linkax.xla.users_line import warn
 
 if TYPE_CHECKING:
     from optax import GradientTransformation
@@ -158,13 +158,12 @@ def _without_covariance(search, z, loss, residual, losses, ended) -> Fit:
 def _warn(result: Fit):
     """Warn where a fit ended in no minimum, or data do not determine all parameters."""
     if result.ended in NO_MINIMUM:
-        warnings.warn(f"the fit ended {result.ended!r}: {NO_MINIMUM[result.ended]}", stacklevel=3)
+        warn(f"the fit ended {result.ended!r}: {NO_MINIMUM[result.ended]}")
     if result.undetermined:
-        warnings.warn(
+        warn(
             f"the data do not determine {', '.join(map(repr, result.undetermined))}: a change of "
             f"{'it' if len(result.undetermined) == 1 else 'them together'} leaves the residual as it is; fix "
-            "some, or measure what they act on",
-            stacklevel=3,
+            "some, or measure what they act on"
         )
 
 

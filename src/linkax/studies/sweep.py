@@ -5,7 +5,6 @@ import itertools
 import numbers
 import os
 import time
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
 
@@ -24,6 +23,7 @@ from linkax.studies.sweep_program import SweepProgram, is_struct
 from linkax.studies.sweep_result import FINE, NOT_RUN, Sweep
 from linkax.studies.sweep_store import SweepStore
 from linkax.xla.enumerations import code, is_item, item
+from linkax.xla.users_line import warn
 from linkax.xla.waiting import Progress, compiling
 
 DEFAULT_CHUNK = 256  # members on one device; larger chunks take no less time for each member
@@ -99,7 +99,7 @@ def sweep(
     for name, category in WARNINGS.items():
         if number := np.sum(code(remarks) == code(getattr(REMARKS, name))):
             told = f"{number} of {count} members: {REMARKS[getattr(REMARKS, name)]} Sweep.remarked tells which."
-            warnings.warn(told, category, stacklevel=2)
+            warn(told, category)
     return Sweep(output, reasons[back], seconds / ran if ran else float("nan"), remarks)
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ from linkax.studies.files import synced, writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
 from linkax.studies.paths import path_parts
 from linkax.studies.sweep_program import SweepProgram
+from linkax.xla.users_line import warn
 
 FORMAT = 2
 LABELLED = ("", "member", "reason", "done")  # arrays whose attributes name the sweep
@@ -106,7 +106,7 @@ class SweepStore(NamedTuple):
                     array[part] = piece
         if damaged:
             told = f"{damaged} members are damaged, and are computed again"
-            warnings.warn(f"store {str(self.path)!r}: {told}", stacklevel=4)
+            warn(f"store {str(self.path)!r}: {told}")
         return done
 
     def _read(self, start, part):
@@ -217,7 +217,7 @@ def _mend(path, files):
         with written_whole(file) as unfinished:
             unfinished.write_bytes(content)
     if damaged:
-        warnings.warn(f"store {str(path)!r}: not as written, and restored: {', '.join(damaged)}", stacklevel=4)
+        warn(f"store {str(path)!r}: not as written, and restored: {', '.join(damaged)}")
 
 
 def _says(present, content) -> bool:

@@ -13,13 +13,14 @@ Most of the time to compile goes into optimisations, which a program that runs o
 """
 
 import os
-import warnings
 from functools import cache
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxlib import version as jaxlib
+
+from linkax.xla.users_line import warn
 
 WHOLE_LOOP_BYTES = 2**20  # read and written by one pass of a loop
 LOOP_BYTES = "xla_cpu_small_while_loop_byte_threshold"
@@ -71,10 +72,9 @@ def makes_kernels_of_loops() -> bool:
     made, flags = "xla_cpu_small_call" in program, os.environ.get("XLA_FLAGS", "")
     chosen = LOOP_BYTES in flags and LOOPS not in flags
     if not made and not chosen and jax.default_backend() == "cpu":
-        warnings.warn(
+        warn(
             f"runs take about five times as long as they could: jaxlib {jaxlib.__version__} makes no kernels of loops; "
             f"import linkax before JAX makes its first array, with {LOOPS} in XLA_FLAGS, or install another jaxlib",
             RuntimeWarning,
-            stacklevel=2,
         )
     return made

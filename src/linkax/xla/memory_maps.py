@@ -4,12 +4,13 @@ Each program holds memory maps, of which Linux gives a process 65 530. Where XLA
 """
 
 import gc
-import warnings
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
+
+from linkax.xla.users_line import warn
 
 COMPILING = "/jax/core/compile/backend_compile_duration"  # what JAX tells its listeners before XLA compiles, and after
 CACHES = [eqx.clear_caches, jax.clear_caches]  # functions that let go of compiled programs
@@ -39,11 +40,10 @@ def make_room(event: str = COMPILING, *_time: Any, **_what: Any) -> None:
             f"compiled programs in use and mapped files hold {_maps()} memory maps, of which this process may have "
             f"{limit}: too many to compile another program; hold fewer, {remedy}, or go on in another process"
         )
-    warnings.warn(
+    warn(
         f"compiled programs held nearly all of the {limit} memory maps that this process may have: JAX's caches have "
         f"been cleared, and what is used again compiles again; to keep more programs {remedy}",
         RuntimeWarning,
-        stacklevel=2,
     )
 
 

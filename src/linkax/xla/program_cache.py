@@ -4,7 +4,6 @@ import os
 import sys
 import tempfile
 import threading
-import warnings
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -14,6 +13,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from linkax.xla.kept_programs import keep_in
 from linkax.xla.memory_maps import COMPILING
+from linkax.xla.users_line import warn
 
 ASKED = "/jax/compilation_cache/compile_requests_use_cache"  # what JAX tells its listeners of a program
 FOUND_OR_KEPT = ("/jax/compilation_cache/cache_hits", "/jax/compilation_cache/cache_misses")
@@ -95,8 +95,7 @@ def _tell(event: str, duration_secs: float, **_what: Any) -> None:
 
 @cache
 def _warn():
-    warnings.warn(
+    warn(
         f"a program that took long to compile is compiled again by the next process: JAX {jax.__version__} keeps none "
-        "that calls back to Python, as progress meters, jax.debug.print and equinox.error_if do",
-        stacklevel=2,
+        "that calls back to Python, as progress meters, jax.debug.print and equinox.error_if do"
     )

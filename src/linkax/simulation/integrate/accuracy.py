@@ -1,6 +1,5 @@
 """The one dial between speed and accuracy."""
 
-import warnings
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -8,6 +7,7 @@ import equinox as eqx
 from linkax.formulations.tangent_space import Metric, TangentSpace
 from linkax.model.numbers import Number, number, one_of, require
 from linkax.xla.arrays import Scalar
+from linkax.xla.users_line import warn
 
 Projection = Literal["both", "stage", "step", "none"]
 
@@ -57,11 +57,10 @@ class Accuracy(eqx.Module):
         if rank_tolerance is not None or metric is not None:
             given = TangentSpace(rank_tolerance, metric="mass" if metric is None else metric)
             self.rank_tolerance, self.metric = given.rank_tolerance, given.metric
-            warnings.warn(
+            warn(
                 "rank_tolerance and metric of linkax.Accuracy are deprecated; give "
                 "formulation=linkax.TangentSpace(rank_tolerance, metric=...) to linkax.simulate",
                 DeprecationWarning,
-                stacklevel=2,
             )
 
     @property

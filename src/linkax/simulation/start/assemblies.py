@@ -1,6 +1,5 @@
 """All assemblies of a mechanism that many starts lead to."""
 
-import warnings
 from typing import NamedTuple
 
 import jax
@@ -27,6 +26,7 @@ from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array
 from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete
+from linkax.xla.users_line import warn
 
 SAME = 1e-6  # of the mechanism's length, or radians
 NOTHING = JointValues((), ())
@@ -78,12 +78,11 @@ def assemblies(
     distinct = [index for index in np.flatnonzero(isolated).tolist() if found.is_new(index)]
     if np.any(moving := found.met & ~isolated):
         distinct.append(int(np.argmax(moving)))
-        warnings.warn(
+        warn(
             f"{np.sum(moving)} of {tries} tries end where the mechanism can move with the positions held, in "
             f"{found.freedoms[distinct[-1]]} ways, which are no separate assemblies; the last state is one of these; "
             "hold more positions to tell them apart",
             AssemblyWarning,
-            stacklevel=2,
         )
     if not distinct:
         return [assemble(mechanism, positions, t=t)]  # which tries harder, or tells why not

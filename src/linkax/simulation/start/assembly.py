@@ -1,6 +1,5 @@
 """Consistent states from partial positions and speeds."""
 
-import warnings
 from typing import Any
 
 import equinox as eqx
@@ -41,6 +40,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.program import Program
 from linkax.xla.static_scatter import scatter_static
 from linkax.xla.tracing import all_concrete, is_first, jit_inline, without_derivatives
+from linkax.xla.users_line import warn
 from linkax.xla.waiting import compiling
 
 GUESS = "give another guess, such as guess={body: lx.Pose(position)} with its rough place"
@@ -118,21 +118,19 @@ def assemble(
     _raise_if_open(mechanism, state, t, remainder, held, moving)
     for beam, (strain, energy) in remainder.strained.items():
         if strain > remainder.most:
-            warnings.warn(
+            warn(
                 f"beam {beam!r} is strained, with an energy of {energy:.3g} J, as the loops do not close otherwise; "
                 f"check lengths and offsets, hold fewer positions, or {GUESS}; linkax.equilibrium finds the strains at "
                 "rest",
                 AssemblyWarning,
-                stacklevel=2,
             )
     for doubt in doubts(mechanism, held, begin, moving, state):
-        warnings.warn(doubt, AssemblyWarning, stacklevel=2)
+        warn(doubt, AssemblyWarning)
     if remainder.undecided and (names := _open_speeds(mechanism, measured, moving, t, state)):
-        warnings.warn(
+        warn(
             f"the configuration is singular, and the speeds asked fit several branches of the motion, which differ in "
             f"the speeds of joints {names}; to choose a branch, ask for the speeds of some of these, too",
             AssemblyWarning,
-            stacklevel=2,
         )
     return state
 
