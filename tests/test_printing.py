@@ -75,6 +75,15 @@ def test_what_is_traced_or_missing_shows_shapes():
             assert str(broken)
 
 
+def test_rounding_prints_as_no_moment_of_inertia():
+    """A slender rod that lies askew has none about its own axis, whatever the eigenvalues of its tensor are."""
+    for tip in np.random.default_rng(0).normal(size=(20, 3)):
+        rod = lx.rod_between("rod", np.zeros(3), tip, mass=3.0)
+        pin = lx.Spherical("pin", lx.GROUND, rod)
+        across = f"{np.sum(tip**2) / 4.0:.6g}"
+        assert f"(0, {across}, {across}) kg m²" in repr(lx.Mechanism([rod], [pin]))
+
+
 @pytest.mark.parametrize("kind", POOL)
 def test_mechanisms_are_short_and_named(kind):
     mechanism = POOL[kind](0)

@@ -71,7 +71,11 @@ def _counts(mechanism, bodies, joints, forces):
 
 
 def _body_row(body):
-    inertia = body.inertia if known(body.inertia) is None else np.linalg.eigvalsh(known(body.inertia))
+    inertia = body.inertia
+    if (tensor := known(inertia)) is not None:
+        moments = np.linalg.eigvalsh(tensor)
+        rounding = 10.0 * np.finfo(moments.dtype).eps * moments[..., -1:]
+        inertia = np.where(np.abs(moments) > rounding, moments, 0.0)
     return body.name, numbers(body.mass, "kg"), numbers(body.center_of_mass, "m", 1), numbers(inertia, "kg m²", 1)
 
 
