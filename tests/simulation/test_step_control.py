@@ -217,6 +217,22 @@ def test_an_element_that_chooses_the_steps_is_named(stiffness, damping, duration
         lx.simulate(mechanism, lx.assemble(mechanism), t1=duration, max_steps=4096)
 
 
+@pytest.mark.parametrize(
+    ("damping", "advised"),
+    [
+        # A wave that rings until the end: implicit steps have to follow it, too.
+        (1e2, {diffrax.Dopri8: "take a rigid joint", lx.Rodas5P: r"Dopri8\(\) takes about as many"}),
+        # One that comes to rest at once: these are 111, and 1462 of an explicit solver.
+        (2e3, {diffrax.Dopri8: r"take solver=linkax.Rodas5P\(\)", lx.Rodas5P: None}),
+    ],
+)
+def test_of_two_solvers_at_most_one_advises_the_other(damping, advised):
+    mechanism = held(1e8, damping)
+    for solver, advice in advised.items():
+        with nullcontext() if advice is None else pytest.warns(lx.StiffnessWarning, match=advice):
+            lx.simulate(mechanism, lx.assemble(mechanism), t1=0.5, solver=solver(), max_steps=4096)
+
+
 def test_a_run_that_an_element_keeps_from_its_end_names_it():
     mechanism = held(1e12, 0.0)
     with pytest.raises(lx.SimulationError, match=r"maximum number of solver steps.*JointSpring.* 1\.0e\+06 1/s"):

@@ -30,7 +30,10 @@ PASSES = 3e-2  # distance from a singular configuration that branches are told a
 MANY_STEPS = 1000
 SHORT = 3e-2  # what the motion turns, or moves in lengths of the mechanism, in a mean step that it does not choose
 FAST = 0.5  # rate of an element that chooses the steps, times their mean length
-RESOLVED = 5.0  # the same, below which an explicit solver takes about as many steps: Dopri8's reach 2 to 3
+RESOLVED = 5.0  # the same, below which an explicit solver takes about as many steps: Dopri8's reach 2 to 4
+UNSTABLE = 2.0  # the same, from which stability bounds Dopri8's steps, and below which their errors do
+SETTLES = 100.0  # decay of damped waves over a run, which rests for most of it
+LOOSE = 1e-5  # tolerance that waves are far below
 
 
 def remark(solution: Solution) -> Any:
@@ -124,8 +127,19 @@ def _is_stiff(solution, known):
     suspect = suspect & (known(_mean_speed(solution)) * step < SHORT)
     if known is np.asarray and not np.any(suspect):
         return never
-    turned = known(jnp.max(_rates(*_ends(solution)), axis=-1)) * step
-    return suspect & (turned > FAST) & (turned < (RESOLVED if _is_implicit(solution) else np.inf))
+    rates, damping = map(known, _rates(*_ends(solution)))
+    turned = rates.max(axis=-1) * step
+    if _is_implicit(solution):
+        suspect = suspect & (turned < RESOLVED) & ~_suits_implicit(solution, known, damping)
+    return suspect & (turned > FAST)
+
+
+def _suits_implicit(solution, known, damping):
+    """Whether an implicit solver may step over fast waves. The solver of the run has no part in it: of two runs that
+    differ in it, at most one advises the other's.
+    """
+    decay = damping / 2.0 * known(solution.run.t1 - solution.run.t0)
+    return (known(_rtol(solution)) >= LOOSE) | (decay > SETTLES)
 
 
 def _is_implicit(solution):
@@ -133,14 +147,17 @@ def _is_implicit(solution):
 
 
 def _stiff(solution):
-    rates, step = np.asarray(_rates(*_ends(solution))), float(_mean_step(solution))
+    (rates, damping), step = map(np.asarray, _rates(*_ends(solution))), float(_mean_step(solution))
     fastest = int(np.argmax(rates))
-    explicit = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
-    rigid = (
-        "take solver=linkax.Rodas5P(), which steps over it where it has come to rest or the tolerance is loose, or a "
-        "rigid joint or constraint in its place"
-    )
-    advice = explicit if _is_implicit(solution) else rigid
+    suits_implicit = _suits_implicit(solution, np.asarray, damping)
+    advice = "take a rigid joint or constraint in its place"
+    if _is_implicit(solution) and not suits_implicit:
+        advice = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
+    elif not _is_implicit(solution) and suits_implicit and rates[fastest] * step > UNSTABLE:
+        advice = (
+            "take solver=linkax.Rodas5P(), which steps over it where it has come to rest or the tolerance is loose, or "
+            "a rigid joint or constraint in its place"
+        )
     return (
         f" {solution.mechanism.forces[fastest].display_name}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not "
         f"the motion, chooses the {int(solution.stats['num_steps'])} steps, {step:.1e} s each; {advice}."
@@ -188,7 +205,7 @@ def _scales(mechanism, tangent_space, t, state):
 
 @Program
 def _rates(mechanism, tangent_space, t, state):
-    """The fastest rate of each force element [1/s], (..., n): √(k / m) or c / m."""
+    """The fastest rate of each force element [1/s], (..., n), √(k / m) or c / m; and the largest c / m, (...)."""
     return _per_member(_rates_of_elements, mechanism, tangent_space, t, state)
 
 
@@ -198,7 +215,7 @@ def _rates_of_elements(mechanism, tangent_space, t, state):
     to_speeds, _ = cholesky_inverse(gram + jnp.diag(stays.astype(gram.dtype)))
     largest = lambda of: spectral_radius(to_speeds @ of @ to_speeds.T)
     stiffness, damping = map(largest, matrices)
-    return jnp.maximum(jnp.sqrt(stiffness), damping)
+    return jnp.maximum(jnp.sqrt(stiffness), damping), jnp.max(damping)
 
 
 def _elements(mechanism, tangent_space, t, state):

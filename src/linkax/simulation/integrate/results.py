@@ -95,8 +95,8 @@ class REMARKS(eqx.Enumeration):
         "one to another."
     )
     stiff = (
-        "A stiff spring, damper or beam, and not the motion, chooses the steps. With an explicit solver, take "
-        "solver=linkax.Rodas5P(), or a rigid joint or constraint in its place."
+        "A stiff spring, damper or beam, and not the motion, chooses the steps. Take a rigid joint or "
+        "constraint in its place; or with an explicit solver, where it comes to rest, solver=linkax.Rodas5P()."
     )
 
 
