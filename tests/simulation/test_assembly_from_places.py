@@ -52,6 +52,18 @@ def test_a_cut_joint_is_guessed_as_one_in_the_tree_is():
     np.testing.assert_allclose(state.q, known.q, atol=1e-9)
 
 
+def test_a_guess_that_closes_the_loops_stays_as_it_is():
+    """Of the pose of a coupler, in both modes, where the crank may turn; and of one that is off, what is near."""
+    mechanism = four_bar()
+    for angle in (1.0, -2.0):
+        place = {"coupler.tip": [1.0, 0.7 * np.sign(angle), 0.0]}
+        known = lx.assemble(mechanism, {"A": angle}, guess=place)
+        pose = lx.Pose(*(part[0] for part in read(mechanism, known).poses()["coupler"]))
+        np.testing.assert_allclose(lx.assemble(mechanism, guess={"coupler": pose}).q, known.q, atol=1e-9)
+        off = lx.Pose(pose.position + np.array([1e-3, 1e-3, 0.0]), pose.orientation)
+        np.testing.assert_allclose(lx.assemble(mechanism, guess={"coupler": off}).q, known.q, atol=1e-2)
+
+
 def test_places_and_velocities_in_the_world_are_held():
     mechanism, known = in_mode(1.0)
     pose, rocker = (read(mechanism, known).poses()[body] for body in ("coupler", "rocker"))

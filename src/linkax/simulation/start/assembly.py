@@ -79,12 +79,12 @@ def assemble(
     For example, `assemble(mechanism, {"crank": 0.3}, guess={"rocker.tip": [1.0, 0.5, 0.0]})`.
 
     Coordinates that are not held change as little as the loops allow from the guess (from the tree's coordinates that
-    fit best, where it names cut joints or places), and speeds that are not held are
-    the smallest that the loops allow, both in radians and lengths of the mechanism. Where the search does not reach
-    closed loops from the guess, it starts again beside it, a little and then farther. Strains of beams stay as guessed,
-    by default zero; where no start closes the loops so, they change, with little energy. In a singular configuration,
-    where branches of the motion cross, speeds lie on the branch of the position where it is a little off (1e-9), else
-    on the branch nearest to these; give more of them to choose another.
+    fit best, where it names cut joints or places), and a guess that closes the loops stays as it is. Speeds that are
+    not held are the smallest that the loops allow, both in radians and lengths of the mechanism. Where the search does
+    not reach closed loops from the guess, it starts again beside it, a little and then farther. Strains of beams stay
+    as guessed, by default zero; where no start closes the loops so, they change, with little energy. In a singular
+    configuration, where branches of the motion cross, speeds lie on the branch of the position where it is a little off
+    (1e-9), else on the branch nearest to these; give more of them to choose another.
 
     Differentiable in the numbers of the mechanism, positions, speeds and the guess, to any order. A coordinate that is
     neither held nor decided by the loops has the derivative of the nearest to the guess, as if the guess closed the

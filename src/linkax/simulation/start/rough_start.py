@@ -20,8 +20,8 @@ from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 
 STARTS = 24
-STEPS = 60
-LOOSE = 1e-2  # weight of coordinates that are not given, next to the loops and to those that are
+STEPS, LAST_STEPS = 60, 20
+LOOSE = 1e-2  # weight of coordinates that are not given, next to the loops and to those that are; none in last steps
 DAMPING, LEAST_DAMPING, LESS, MORE = 1e-2, 1e-9, 0.3, 4.0
 
 
@@ -42,15 +42,17 @@ def rough_start(
 
 
 class _Fit(eqx.Module):
-    """Least squares of loop rows, of what is held, of the guess, and, with little weight, of the way from `begin`.
+    """Least squares of loop rows, of what is held, of the guess, and of the way from `begin`.
 
-    - `demand`: all but the last of these, as rows; `weights`: of these. `keeps`: weights of that way.
+    - `demand`: all but the last of these, as rows; `weights`: of these. `keeps`: weights of that way, `given` where
+      coordinates are; of the others it is little, to choose among starts, and then none, so as not to bias the guess.
     """
 
     demand: LoopClosure
     weights: Array
     begin: Array
     keeps: Array
+    given: Array
 
     @staticmethod
     def of(demand: LoopClosure, rough: JointValues, begin: Array, given: Bool[np.ndarray, " n_v"]) -> "_Fit":
@@ -60,36 +62,38 @@ class _Fit(eqx.Module):
         all_ = LoopClosure(system, demand.t, both)
         count = jax.eval_shape(all_.rows_at, begin).size - len(slides)
         weights = jnp.concatenate([jnp.ones(count), jnp.where(slides, 1.0 / system.length, 1.0)])
-        return _Fit(all_, weights, begin, jnp.where(given, 1.0, LOOSE) / system.scales)
+        keeps = jnp.where(given, 1.0, LOOSE) / system.scales
+        return _Fit(all_, weights, begin, keeps, jnp.asarray(given))
 
-    def rows(self, q: Float[Array, " n_q"]) -> Float[Array, " n"]:
-        return self._all(q, self.demand.rows_at(q))
-
-    def _all(self, q, rows):
+    def _all(self, q, rows, keeps):
         way = speeds(self.demand.system.topology, q, q - self.begin)
-        return jnp.concatenate([self.weights * rows, self.keeps * way])
+        return jnp.concatenate([self.weights * rows, keeps * way])
 
     def descend(self, q: Float[Array, " n_q"]) -> tuple[Float[Array, " n_q"], Float[Array, ""]]:
-        """Find coordinates from which no step leads down, and the sum of squares there."""
+        """Find coordinates from which no step leads down, and the sum of squares where the last steps began."""
         system, squared = self.demand.system, lambda rows: jnp.sum(rows * rows)
         moves = jnp.asarray(system.scales).at[strains_of(system)].set(0.0)
 
-        def improve(_, state):
+        def improve(count, state):
             q, missed, damping = state
+            is_last = count >= STEPS
+            keeps = jnp.where(is_last & ~self.given, 0.0, self.keeps)
+            damping = jnp.where(count == STEPS, DAMPING, damping)
             rows, slopes = self.demand.linearised(q)
-            rows, slopes = self._all(q, rows), jnp.concatenate([self.weights[:, None] * slopes, jnp.diag(self.keeps)])
+            rows, slopes = self._all(q, rows, keeps), jnp.concatenate([self.weights[:, None] * slopes, jnp.diag(keeps)])
             slopes = slopes * moves
             normal = slopes.T @ slopes + damping * jnp.eye(len(moves))
             step = jax.scipy.linalg.solve(normal, -(rows @ slopes), assume_a="pos")
             step = step * jnp.minimum(1.0, ratio(LONGEST_STEP, jnp.max(jnp.abs(step))))
             tried = retract(system.topology, q, moves * step)
-            reached = squared(self.rows(tried))
-            falls = reached < missed
+            here, reached = squared(rows), squared(self._all(tried, self.demand.rows_at(tried), keeps))
+            falls = reached < here
             damping = jnp.where(falls, jnp.maximum(LESS * damping, LEAST_DAMPING), MORE * damping)
-            return jnp.where(falls, tried, q), jnp.where(falls, reached, missed), damping
+            missed = jnp.where(is_last, missed, jnp.where(falls, reached, here))
+            return jnp.where(falls, tried, q), missed, damping
 
-        begin = (q, squared(self.rows(q)), jnp.asarray(DAMPING, q.dtype))
-        found, missed, _ = lax.fori_loop(0, STEPS, improve, begin)
+        begin = (q, jnp.asarray(jnp.inf, q.dtype), jnp.asarray(DAMPING, q.dtype))
+        found, missed, _ = lax.fori_loop(0, STEPS + LAST_STEPS, improve, begin)
         return found, missed
 
 
