@@ -152,6 +152,8 @@ class Drive(LinearConstraint):
     def right_side(self, t: Number) -> Scalar:
         if self.motion is not None:
             return self.motion(t)
+        assert self.speed is not None
+        assert self.start is not None
         return self.start + self.speed * t
 
     def held(self, t: Number, unless: Any = False) -> "Drive | Coupling":
