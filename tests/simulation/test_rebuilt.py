@@ -96,6 +96,14 @@ def test_another_constant_speed_compiles_nothing():
     np.testing.assert_allclose([by_speed, by_start], [[0.5, 1.0], [1.0, 0.0]], atol=1e-12)
 
 
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_drive_at_constant_speed_goes_on_or_is_held(moves):
+    drive = lx.Drive("motor", "hinge", speed=6.0, start=0.3)
+    held = drive.held(0.2, jnp.asarray(moves))
+    np.testing.assert_allclose(held.right_side(1.0), 6.3 if moves else 1.5, rtol=1e-15)
+    np.testing.assert_allclose(drive.held(0.2).right_side(1.0), 1.5, rtol=1e-15)
+
+
 def test_a_mechanism_whose_functions_have_changed_is_refused():
     speeds = {"motor": 2.0}
     arm = lx.rod("arm", 1.0, 1.0)
