@@ -215,7 +215,7 @@ RELATED = {
     "drive of a ball at constant speed": (lx.Drive("motor", "ball", speed=1.0), ["'motor'", "'ball'", "3 speeds"]),
     "drive of a turning ball": (lx.Drive("motor", ("ball", 1), jnp.sin), ["'motor'", "'ball'", "quaternion"]),
     "name taken by a joint": (lx.Distance("pin", lx.GROUND, LINK, 1.0), ["'pin'", "2 times", "of its own"]),
-    "no constraint": (lx.Gravity([0, 0, 1]), ["constraints", "Gravity", "Coupling"]),
+    "no constraint": (lx.Gravity([0, 0, 1]), ["constraints", "Gravity", "forces=[...]"]),
 }
 
 
