@@ -44,9 +44,13 @@ def find(name: Any, names: Sequence[str], what: str) -> int:
 
 
 def _unknown(name, names, what) -> str:
+    return f"unknown {what} {name!r}{meant(name, names)}; known: {', '.join(map(repr, names)) or 'none'}"
+
+
+def meant(name: Any, names: Sequence[str]) -> str:
+    """Ask whether the closest of names was meant, in words for after an unknown one; nothing where none is close."""
     close = get_close_matches(name, names, 1) if isinstance(name, str) else []
-    meant = "".join(f" (did you mean {other!r}?)" for other in close)
-    return f"unknown {what} {name!r}{meant}; known: {', '.join(map(repr, names)) or 'none'}"
+    return "".join(f" (did you mean {other!r}?)" for other in close)
 
 
 def optional_name(name: Any, kind: str) -> str | None:

@@ -5,7 +5,6 @@ A `Free` joint that is cut constrains nothing, and its coordinates and speeds ar
 
 import copy
 from collections.abc import Iterator, Mapping
-from difflib import get_close_matches
 from typing import Any
 
 import jax
@@ -16,6 +15,7 @@ from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND, GROUND_NAME, Frame
 from linkax.model.joints.free import Free
 from linkax.model.mechanism import Mechanism
+from linkax.model.names import meant
 from linkax.model.numbers import number, require_type, rotation_matrix, value
 from linkax.model.poses import Pose, Velocity
 from linkax.model.terms import Term
@@ -120,10 +120,9 @@ class Places:
     def _unknown(self, key, what) -> str:
         joints, bodies = self.mechanism.topology.joints, self.mechanism.bodies
         places = [name for body in bodies for name in (body.name, *(f"{body.name}.{label}" for label in body.frames))]
-        meant = "".join(f" (did you mean {name!r}?)" for name in get_close_matches(str(key), [*joints, *places], 1))
         listed = lambda names: ", ".join(map(repr, names))
         return (
-            f"{what} of unknown joint or body {key!r}{meant}; known joints: {listed(joints)}; "
+            f"{what} of unknown joint or body {key!r}{meant(key, [*joints, *places])}; known joints: {listed(joints)}; "
             f"known bodies, and frames on them: {listed(places)}"
         )
 
