@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from enum import IntEnum
 from pathlib import Path
 
 import diffrax
@@ -14,9 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 from mechanisms import crank_slider
 
 import linkax as lx
+from linkax.model.functions import Function
 from linkax.straight_line.known import flat_with_known
 from linkax.xla import kept_programs, program_cache
 from linkax.xla.descriptions import Undescribed, description
@@ -92,7 +95,7 @@ def test_a_second_process_traces_and_compiles_nothing(tmp_path):
 
 
 def test_kept_programs_call_lapack(tmp_path):
-    """Which JAX loads where it lowers, as it does not here; and a file cut short is none."""
+    """Which JAX loads where it lowers, as it does not here; and a file that is damaged is none."""
     matrix = np.eye(40) + 0.1 * np.arange(40.0)[:, None]
     for traces in (True, False, True, False):
         (found, traced), _ = ran(tmp_path, program=SOLVE)
@@ -101,7 +104,9 @@ def test_kept_programs_call_lapack(tmp_path):
         (file,) = (tmp_path / "linkax").iterdir()
         assert b"lapack_" in file.read_bytes()
         if not traces:
-            file.write_bytes(file.read_bytes()[:1000])
+            text = bytearray(file.read_bytes())
+            text[len(text) // 2] ^= 1
+            file.write_bytes(text)
 
 
 @pytest.fixture
@@ -160,11 +165,63 @@ class Mine(eqx.Module):
     number: float = 1.0
 
 
-def test_what_is_a_users_own_is_not_described():
-    """Its name may stay where what it does changes."""
-    for own in (Mine(), Mine, test_what_is_a_users_own_is_not_described, functools.partial(lambda: 1), object()):
-        with pytest.raises(Undescribed):
-            description(own)
+class Count(IntEnum):
+    one = 1
+
+
+class Length(float):
+    pass
+
+
+made: dict = {"__name__": "linkax"}
+exec("class Made:\n    pass\n\ndef doubled(t):\n    return 2.0 * t", made)
+doubled, partly = made["doubled"], functools.partial(jnp.dot, Mine())
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        Mine(),
+        Mine,
+        Count.one,
+        Length(1.0),
+        np.ones(2).view(np.recarray),
+        made["Made"],
+        made["Made"](),
+        functools.partial(lambda: 1),
+        object(),
+        compilations,
+        *map(
+            Function,
+            [
+                lambda t: Mine(t).number,
+                lambda t: Count.one * t,
+                lambda t: doubled(t),
+                lambda t: partly(t),
+                lambda t: jnp.interp(t, *np.loadtxt("profile.csv")),
+                lambda t: t * float(os.environ.get("RATE", "1")),
+                lambda t: t * np.random.normal(),
+                lambda t: t * len(pytest.__name__),
+            ],
+        ),
+    ],
+)
+def test_what_may_change_is_not_described(own):
+    """A name may stay where what it means changes, and so may what is outside of a program."""
+    with pytest.raises(Undescribed):
+        description(jax.tree.structure(own) if isinstance(own, Function) else own)
+
+
+def test_functions_of_a_user_are_described_by_what_they_compute():
+    def law(factor, offsets=(0.0,), power=2):
+        own = lambda t: t**power
+        return lambda t: factor * own(t) + offsets[0]
+
+    described = lambda *args: description(jax.tree.structure(Function(law(*args))))
+    alike = [(1.0,), (1.0, (0.0,)), (1.0, (0.0,), 2)]
+    assert len({described(*args) for args in alike}) == 1
+    others = [(2.0,), (1,), (np.float32(1.0),), (1.0, [0.0]), (1.0, (-0.0,)), (1.0, (0.0,), 3)]
+    assert len({described(*args) for args in (*alike, *others)}) == 1 + len(others)
 
 
 def test_equal_things_are_described_alike():

@@ -9,6 +9,7 @@ import matplotlib
 import pytest
 
 import linkax as lx
+from linkax.xla.kept_programs import keep_in
 
 SOURCE = Path(__file__).parents[1] / "notebooks"
 PAGES = sorted((*SOURCE.glob("*.md"), *SOURCE.glob("reference/*.md")))
@@ -34,10 +35,11 @@ def test_every_public_name_is_in_an_example_of_its_page():
 
 @pytest.fixture
 def settings_kept():
-    """Those of JAX that `lx.cache_programs` changes."""
+    """Those of JAX that `lx.cache_programs` changes, and that no programs are kept."""
     names = [name for name in jax.config.values if "cache" in name]
     before = {name: jax.config.values[name] for name in names}
     yield
+    keep_in(None)
     for name, value in before.items():
         jax.config.update(name, value)
 

@@ -6,6 +6,7 @@ and the values that they close over and read as globals are equal. JAX arrays th
 are taken out. A function that cannot be compared equals itself alone.
 """
 
+import sys
 import types
 import weakref
 from collections.abc import Callable, Sequence
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from linkax.model.code_walk import Maker, Same, Undecided, Walk
-from linkax.xla.descriptions import description
+from linkax.xla.descriptions import Undescribed, description
 
 
 class Code:
@@ -85,11 +86,12 @@ def _(code: Code) -> Any:
 @description.register
 def _(same: Same) -> Any:
     value = same.value
-    if isinstance(value, dict):  # the globals of a function: of them, what it reads is described apart
-        return "globals", value.get("__name__")
-    if isinstance(value, type):  # likewise of a class
-        return "class", value.__module__, value.__qualname__
-    return description(value)
+    if not isinstance(value, dict):
+        return description(value)
+    module = sys.modules.get(value.get("__name__", ""))
+    if module is None or vars(module) is not value:
+        raise Undescribed(same)
+    return "globals", module.__name__  # of which what the function reads is described apart
 
 
 def _code_of(function: Callable[..., Any]) -> Code:

@@ -14,6 +14,7 @@ import re
 import sys
 import types
 from collections.abc import Iterable
+from contextlib import suppress
 from enum import Enum
 from functools import singledispatch
 from pathlib import Path
@@ -26,7 +27,12 @@ from linkax.xla.flags import makes_kernels_of_loops
 
 # Packages that change with their version alone; linkax with its sources.
 LIBRARIES = ("linkax", "jax", "jaxlib", "equinox", "diffrax", "lineax", "optimistix", "optax", "numpy", "scipy")
-STANDARD = ("builtins", "functools", "operator", "math", "collections", "typing", "abc")
+STANDARD = ("builtins", "functools", "operator", "math", "cmath", "collections", "typing", "types", "abc", "enum")
+# Names in users' functions by which these may read what is outside of them.
+_OUTSIDE = re.compile(
+    "open.*|input|load.*|from(file|regex)|genfromtxt|memmap|DataSource|rand.*|debug|.*callback.*|id|hash"
+)
+_HEAP = 1 << 9  # of a class that Python code has made
 _MISSING = object()
 
 
@@ -46,7 +52,7 @@ def description(value: Any) -> Any:
         fields = [(field.name, getattr(value, field.name, _MISSING)) for field in dataclasses.fields(value)]
         return named(type(value)), of_each(entry for field in fields if field[1] is not _MISSING for entry in field)
     if isinstance(value, jax.Array):
-        return description(np.asarray(value))
+        return "array of JAX", value.weak_type, description(np.asarray(value))
     if hasattr(value, "__qualname__") and not isinstance(value, np.ufunc):
         return named(value)
     # One that a library has once, such as its sign for what is missing.
@@ -71,22 +77,27 @@ def named(value: Any) -> tuple[str, str, str]:
     found = sys.modules.get(module)
     for part in name.split("."):
         found = getattr(found, part, None)
-    of_python = module == "builtins" and isinstance(value, type)  # which does not name all of its classes
-    if module.partition(".")[0] not in (*LIBRARIES, *STANDARD) or not (found is value or of_python):
+    of_python = isinstance(value, type) and not value.__flags__ & _HEAP  # which does not name all of its classes
+    if str(module).partition(".")[0] not in (*LIBRARIES, *STANDARD) or not (found is value or of_python):
         raise Undescribed(value)
     return type(value).__name__, module, name
 
 
 @description.register
-def _(value: bool | int | float | complex | str | bytes | types.EllipsisType | np.dtype | range | slice | None) -> Any:
-    return type(value).__name__, repr(value)  # tells 0.0 from -0.0, and 1 from 1.0
+def _(value: bool | int | float | complex | str | bytes | types.EllipsisType | np.dtype | None) -> Any:
+    return named(type(value)), repr(value)  # tells 0.0 from -0.0, and 1 from 1.0
+
+
+@description.register
+def _(value: range | slice) -> Any:
+    return named(type(value)), of_each((value.start, value.stop, value.step))
 
 
 @description.register
 def _(value: np.ndarray | np.generic) -> Any:
     if value.dtype.hasobject:
         raise Undescribed(value)
-    return type(value).__name__, repr(value.dtype), value.shape, value.tobytes()
+    return named(type(value)), repr(value.dtype), value.shape, value.tobytes()
 
 
 @description.register
@@ -116,6 +127,8 @@ def _(value: types.MethodType) -> Any:
 
 @description.register
 def _(value: types.ModuleType) -> Any:
+    if value.__name__.partition(".")[0] not in (*LIBRARIES, *STANDARD):
+        raise Undescribed(value)
     return "module", value.__name__
 
 
@@ -132,7 +145,7 @@ def _(value: types.FunctionType) -> Any:
     try:
         return named(value)
     except Undescribed:
-        if value.__module__.partition(".")[0] not in LIBRARIES:
+        if str(value.__module__).partition(".")[0] not in LIBRARIES:
             raise
     # One without a name of its own: by its code, and what it closes over.
     cells = [cell.cell_contents for cell in value.__closure__ or ()]
@@ -141,7 +154,9 @@ def _(value: types.FunctionType) -> Any:
 
 @description.register
 def _(value: types.CodeType) -> Any:
-    names = value.co_names, value.co_varnames, value.co_freevars, value.co_cellvars
+    names = value.co_name, value.co_names, value.co_varnames, value.co_freevars, value.co_cellvars
+    if any(map(_OUTSIDE.fullmatch, value.co_names)):
+        raise Undescribed(value)
     counts = value.co_argcount, value.co_posonlyargcount, value.co_kwonlyargcount, value.co_flags
     return "code", value.co_code, value.co_exceptiontable, names, counts, of_each(value.co_consts)
 
@@ -149,19 +164,26 @@ def _(value: types.CodeType) -> Any:
 @functools.cache
 def of_libraries() -> tuple[Any, ...]:
     """The versions of Python and all libraries, and the sources of linkax."""
-    versions = [(name, importlib.metadata.version(name)) for name in LIBRARIES[1:] if name in sys.modules]
+    versions = [(name, _version(name)) for name in LIBRARIES[1:]]
     root = Path(__file__).parents[1]
     sources = [(path.relative_to(root).as_posix(), path.read_bytes()) for path in sorted(root.rglob("*.py"))]
     return sys.version, tuple(versions), hashlib.sha256(repr(sources).encode()).hexdigest()
+
+
+def _version(name):
+    with suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(name)
 
 
 @functools.cache
 def of_processor() -> tuple[str, ...]:
     """What the processor can do, as far as the system tells."""
     of_linux = Path("/proc/cpuinfo")
-    lines = of_linux.read_text().splitlines() if of_linux.exists() else []
+    if not of_linux.exists():  # other systems tell too little, so it is this machine
+        return platform.machine(), platform.processor(), platform.node()
     told = ("model name", "flags", "Features", "CPU part")
-    return platform.machine(), platform.processor(), *sorted({line for line in lines if line.startswith(told)})
+    lines = of_linux.read_text().splitlines()
+    return platform.machine(), *sorted({line for line in lines if line.startswith(told)})
 
 
 _NAMES = [

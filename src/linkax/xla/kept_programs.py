@@ -6,9 +6,9 @@ written of which JAX tells that it found it.
 """
 
 import hashlib
-import os
 import pickle
 import threading
+import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -22,13 +22,12 @@ from jax.experimental import serialize_executable
 from jax.stages import Compiled, Lowered
 from jaxtyping import PyTree
 
-from linkax.xla.descriptions import Undescribed, description, of_libraries, of_processor, of_settings, settings
+from linkax.xla.descriptions import description, of_libraries, of_processor, of_settings, settings
 from linkax.xla.flat import Flat
 from linkax.xla.memory_maps import CACHES, make_room
 
 FOUND = "/jax/compilation_cache/cache_hits"  # what JAX tells its listeners where it reads a program from its files
-# What is raised of programs that cannot be written, or of a full disk.
-UNKEPT = (OSError, ValueError, TypeError, AttributeError, NotImplementedError, pickle.PicklingError)
+DIGEST = hashlib.sha256().digest_size
 _folder: list[Path] = []
 _met: dict[Any, "KeptProgram | None"] = {}
 _thread = threading.local()
@@ -38,12 +37,14 @@ CACHES.append(_met.clear)
 def keep_in(folder: Path | None) -> None:
     """Keep programs in a folder from now on, or no longer."""
     _folder[:] = [] if folder is None else [folder]
+    of_libraries()  # while the sources are those that run
 
 
 def are_kept() -> bool:
-    """Whether programs are kept; settings of JAX may forbid it."""
+    """Whether programs are kept; settings of JAX may forbid it, or ask where a number is none."""
     config: Any = jax.config
-    return bool(_folder) and config.jax_enable_compilation_cache and not config.jax_disable_jit
+    asks = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
+    return bool(_folder) and config.jax_enable_compilation_cache and not asks
 
 
 class KeptProgram:
@@ -72,10 +73,12 @@ def kept_program(program: tuple[Any, ...], given: Flat, lower: Callable[[Flat, s
         return None
     shapes = tuple((array.shape, array.dtype, bool(getattr(array, "weak_type", False))) for array in given.arrays)
     asked = program, jax.tree.structure(given), shapes, settings()
-    if asked not in _met:
-        place = _place(*asked)
-        _met[asked] = None if place is None else _read(place, given) or _new(place, lower(given, place.name))
-    return _met[asked]
+    if asked in _met:
+        return _met[asked]
+    place = _place(*asked)
+    found = None if place is None else _read(place, given) or _new(place, lower(given, place.name))
+    _met[asked] = found
+    return found
 
 
 def _at_home(given):
@@ -90,7 +93,7 @@ def _place(program, structure, shapes, given_settings):
     around = of_settings(given_settings), of_libraries(), of_processor()
     try:
         found = program, description(structure), shapes, around
-    except (Undescribed, RecursionError, TypeError):
+    except Exception:  # `Undescribed`, or of an object of a user
         return None
     return _folder[0] / "linkax" / hashlib.sha256(repr(found).encode()).hexdigest()[:40]
 
@@ -98,15 +101,21 @@ def _place(program, structure, shapes, given_settings):
 def _read(place, given):
     make_room()
     try:
-        program, blank = pickle.loads(place.read_bytes())
+        text = place.read_bytes()
+    except OSError:
+        return None
+    digest, text = text[:DIGEST], text[DIGEST:]
+    try:
+        if hashlib.sha256(text).digest() != digest:
+            raise ValueError
+        program, blank = pickle.loads(text)
         if b"lapack_" in program:
             _load_lapack()
         structures = jax.tree.structure(((given,), {})), jax.tree.structure(Flat.of(blank))
         compiled = serialize_executable.deserialize_and_load(program, *structures, execution_devices=jax.devices()[:1])
-    except FileNotFoundError:
-        return None
-    except Exception:  # a file cut short, which may raise anything
-        place.unlink(missing_ok=True)
+    except Exception:  # a file that is damaged, or that JAX cannot read any more
+        with suppress(OSError):
+            place.unlink()
         return None
     return KeptProgram(blank, lambda: compiled)
 
@@ -127,7 +136,7 @@ def _new(place, lowered):
         _thread.found = False
         compiled = lowered.compile()
         if not _thread.found:
-            with suppress(*UNKEPT):
+            with suppress(Exception):  # of what cannot be written, or a full disk
                 _write(place, pickle.dumps((serialize_executable.serialize(compiled)[0], blank)))
                 for copy in place.parents[1].glob(f"jit_*_{place.name}-*"):  # of JAX's
                     copy.unlink(missing_ok=True)
@@ -148,6 +157,6 @@ def _note(event: str, **_what: Any) -> None:
 
 def _write(place, text):
     place.parent.mkdir(parents=True, exist_ok=True)
-    written = place.with_name(f"{place.name}-{os.getpid()}")
-    written.write_bytes(text)
+    written = place.with_name(f"{place.name}-{uuid.uuid4()}")
+    written.write_bytes(hashlib.sha256(text).digest() + text)
     written.replace(place)  # at once, for other processes

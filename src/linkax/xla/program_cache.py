@@ -48,7 +48,7 @@ def cache_programs(folder: str | os.PathLike | None = None) -> str:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     compilation_cache.reset_cache()  # which JAX opens when it compiles first
-    keep_in(None if "://" in path else Path(path))
+    keep_in(None if "://" in path else Path(path).absolute())
     _listen()
     return path
 
