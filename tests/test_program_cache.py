@@ -173,6 +173,10 @@ class Length(float):
     pass
 
 
+class Lengths(np.ndarray):
+    pass
+
+
 made: dict = {"__name__": "linkax"}
 exec("class Made:\n    pass\n\ndef doubled(t):\n    return 2.0 * t", made)
 doubled, partly = made["doubled"], functools.partial(jnp.dot, Mine())
@@ -185,7 +189,7 @@ doubled, partly = made["doubled"], functools.partial(jnp.dot, Mine())
         Mine,
         Count.one,
         Length(1.0),
-        np.ones(2).view(np.recarray),
+        np.ones(2).view(Lengths),
         made["Made"],
         made["Made"](),
         functools.partial(lambda: 1),

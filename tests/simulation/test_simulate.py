@@ -13,7 +13,7 @@ import linkax as lx
 from linkax.cli import progress_run
 from linkax.scenes import SCENES
 from linkax.simulation.read.observables import Observables
-from linkax.xla.tracing import Program
+from linkax.xla.program import Program
 
 
 def pendulum(length=1.0, forces=()):
