@@ -10,7 +10,7 @@ import linkax
 SOURCE = Path(linkax.__file__).parent
 CONTRIBUTING = Path(__file__).parents[1] / "CONTRIBUTING.md"
 # From the lowest to the highest, as CONTRIBUTING says: rooms of a layer as layer.room.
-LAYERS = ["xla", "tables", "straight_line", "spatial", "model", "linalg", "equations", "formulations"]
+LAYERS = ["files", "xla", "tables", "straight_line", "spatial", "model", "linalg", "equations", "formulations"]
 LAYERS += [f"simulation.{room}" for room in ("start", "integrate", "explain", "read", "simulate")]
 LAYERS += ["analysis", "studies", "scenes", "scenery", "view", "plot", "cli"]
 # Methods that hand on to a higher layer, which they import when they are called.

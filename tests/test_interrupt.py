@@ -14,7 +14,7 @@ import pytest
 
 import linkax as lx
 from linkax.cli import compare, simulate
-from linkax.studies.files import remove_unfinished, written_whole
+from linkax.files import remove_unfinished, written_whole
 
 LIMIT = 300.0  # seconds
 SOON = 5.0

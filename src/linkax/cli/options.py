@@ -11,11 +11,11 @@ from typing import Any, SupportsFloat, cast
 import diffrax
 
 import linkax as lx
+from linkax.files import remove_unfinished, writable_folder, written_whole
 from linkax.scenes import Scene, scene
 from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.rosenbrock import Rodas5P
 from linkax.simulation.integrate.runge_kutta import RungeKutta4
-from linkax.studies.files import remove_unfinished, writable_folder, written_whole
 from linkax.xla.waiting import end_line, is_watched, tell
 
 OF_DIFFRAX = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno5")

@@ -21,10 +21,10 @@ from linkax.cli.options import (
 )
 from linkax.cli.progress_run import simulate_in_segments
 from linkax.cli.report import states, summary, trajectory
+from linkax.files import written_whole
 from linkax.formulations.named import formulation
 from linkax.simulation.explain.diagnosis import cause
 from linkax.simulation.read.solution import Solution
-from linkax.studies.files import written_whole
 
 INTERVALS = 1000
 SHOWN = 5  # times of passages that are printed

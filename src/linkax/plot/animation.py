@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
+from linkax.files import written_whole
 from linkax.plot.drawing import draw
 from linkax.scenery.scenery import Points, reached, scenery_of
 from linkax.simulation.read.solution import Solution
@@ -66,7 +67,8 @@ def animate(
     frames[0].save(stream, format="GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
     animation = Animation(stream.getvalue())
     if path is not None:
-        Path(path).write_bytes(animation.gif)
+        with written_whole(Path(path)) as part:
+            part.write_bytes(animation.gif)
     return animation
 
 

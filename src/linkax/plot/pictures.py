@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from linkax import plot
+from linkax.files import written_whole
 from linkax.scenery.scenery import Points
 from linkax.simulation.read.solution import Solution
-from linkax.studies.files import written_whole
 
 
 def write_pictures(solution: Solution, points: Points, folder: Path) -> list[Path]:
@@ -28,8 +28,7 @@ def write_pictures(solution: Solution, points: Points, folder: Path) -> list[Pat
             figure.savefig(path, dpi=130, format="png")
         written.append(folder / f"{name}.png")
     if np.sum(np.isfinite(np.asarray(solution.ts))) > 1:
-        with written_whole(folder / "mechanism.gif") as path:
-            plot.animate(solution, path, points)
+        plot.animate(solution, folder / "mechanism.gif", points)
         written.append(folder / "mechanism.gif")
         solution.view(folder / "mechanism.html", points=points)
         written.append(folder / "mechanism.html")

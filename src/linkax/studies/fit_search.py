@@ -15,8 +15,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 
+from linkax.files import writable_folder, written_whole
 from linkax.model.numbers import require_type
-from linkax.studies.files import writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
 from linkax.studies.free_parameters import FreeParameters
 from linkax.xla.arrays import Array

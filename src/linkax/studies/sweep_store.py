@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from linkax.studies.files import synced, writable_folder, written_whole
+from linkax.files import synced, writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
 from linkax.studies.paths import path_parts
 from linkax.studies.sweep_program import SweepProgram

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from linkax.files import written_whole
 from linkax.model.numbers import require_type
 from linkax.scenery.scenery import Points, reached, scenery_of
 from linkax.simulation.read.solution import Solution
-from linkax.studies.files import written_whole
 from linkax.view.contents import contents
 
 MOST_NUMBERS = 300_000  # in a page, of poses; of longer runs, fewer of the saved times are shown

@@ -8,7 +8,6 @@ written of which JAX tells that it found it.
 import hashlib
 import pickle
 import threading
-import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -22,6 +21,7 @@ from jax.experimental import serialize_executable
 from jax.stages import Compiled, Lowered
 from jaxtyping import PyTree
 
+from linkax.files import written_whole
 from linkax.xla.descriptions import description, of_libraries, of_processor, of_settings, settings
 from linkax.xla.flat import Flat
 from linkax.xla.memory_maps import CACHES, make_room
@@ -157,6 +157,5 @@ def _note(event: str, **_what: Any) -> None:
 
 def _write(place, text):
     place.parent.mkdir(parents=True, exist_ok=True)
-    written = place.with_name(f"{place.name}-{uuid.uuid4()}")
-    written.write_bytes(hashlib.sha256(text).digest() + text)
-    written.replace(place)  # at once, for other processes
+    with written_whole(place) as part:
+        part.write_bytes(hashlib.sha256(text).digest() + text)
