@@ -26,7 +26,7 @@ import numpy as np
 from linkax.xla.flags import makes_kernels_of_loops
 
 # Packages that change with their version alone; linkax with its sources.
-LIBRARIES = ("linkax", "jax", "jaxlib", "equinox", "diffrax", "lineax", "optimistix", "optax", "numpy", "scipy")
+PACKAGES = ("linkax", "jax", "jaxlib", "equinox", "diffrax", "lineax", "optimistix", "optax", "numpy", "scipy")
 STANDARD = ("builtins", "functools", "operator", "math", "cmath", "collections", "typing", "types", "abc", "enum")
 # Names in users' functions by which these may read what is outside of them.
 _OUTSIDE = re.compile(
@@ -78,7 +78,7 @@ def named(value: Any) -> tuple[str, str, str]:
     for part in name.split("."):
         found = getattr(found, part, None)
     of_python = isinstance(value, type) and not value.__flags__ & _HEAP  # which does not name all of its classes
-    if str(module).partition(".")[0] not in (*LIBRARIES, *STANDARD) or not (found is value or of_python):
+    if str(module).partition(".")[0] not in (*PACKAGES, *STANDARD) or not (found is value or of_python):
         raise Undescribed(value)
     return type(value).__name__, module, name
 
@@ -127,7 +127,7 @@ def _(value: types.MethodType) -> Any:
 
 @description.register
 def _(value: types.ModuleType) -> Any:
-    if value.__name__.partition(".")[0] not in (*LIBRARIES, *STANDARD):
+    if value.__name__.partition(".")[0] not in (*PACKAGES, *STANDARD):
         raise Undescribed(value)
     return "module", value.__name__
 
@@ -145,7 +145,7 @@ def _(value: types.FunctionType) -> Any:
     try:
         return named(value)
     except Undescribed:
-        if str(value.__module__).partition(".")[0] not in LIBRARIES:
+        if str(value.__module__).partition(".")[0] not in PACKAGES:
             raise
     # One without a name of its own: by its code, and what it closes over.
     cells = [cell.cell_contents for cell in value.__closure__ or ()]
@@ -164,7 +164,7 @@ def _(value: types.CodeType) -> Any:
 @functools.cache
 def of_libraries() -> tuple[Any, ...]:
     """The versions of Python and all libraries, and the sources of linkax."""
-    versions = [(name, _version(name)) for name in LIBRARIES[1:]]
+    versions = [(name, _version(name)) for name in PACKAGES[1:]]
     root = Path(__file__).parents[1]
     sources = [(path.relative_to(root).as_posix(), path.read_bytes()) for path in sorted(root.rglob("*.py"))]
     return sys.version, tuple(versions), hashlib.sha256(repr(sources).encode()).hexdigest()

@@ -11,12 +11,12 @@ from typing import Any, cast
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-from linkax.xla.kept_programs import keep_in
+from linkax.xla.kept_programs import FOUND, keep_in
 from linkax.xla.memory_maps import COMPILING
 from linkax.xla.users_line import warn
 
 ASKED = "/jax/compilation_cache/compile_requests_use_cache"  # what JAX tells its listeners of a program
-FOUND_OR_KEPT = ("/jax/compilation_cache/cache_hits", "/jax/compilation_cache/cache_misses")
+FOUND_OR_KEPT = (FOUND, "/jax/compilation_cache/cache_misses")
 LONG = 1.0  # time to compile that is worth a warning [s]
 
 _thread = threading.local()
