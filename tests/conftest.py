@@ -38,6 +38,8 @@ settings.load_profile("repeatable")
 sys.path.insert(0, str(Path(__file__).parent))
 from unchecked import unchecked  # noqa: E402
 
+from linkax.xla.kept_programs import keep_in  # noqa: E402
+
 _raises = pytest.raises
 
 
@@ -60,6 +62,7 @@ LONGEST = (
     "test_compiler",
 )
 gc.set_threshold(20_000, 20, 50)  # tracing makes many objects at a time, few of them in cycles
+CACHE_SETTINGS = {name: value for name, value in jax.config.values.items() if "cache" in name}
 MOST_MAPS = 40_000  # of the 65 530 that Linux gives a process; beyond them the compiler crashes
 
 
@@ -75,6 +78,16 @@ def pytest_collection_modifyitems(config, items):
         items[:] = filter(in_share, items)
     place = {name: index for index, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))
+
+
+@pytest.fixture(autouse=True)
+def _programs_are_kept_no_longer():
+    """Undo what `lx.cache_programs` changes, which the command line calls too; programs kept on disk run otherwise."""
+    yield
+    keep_in(None)
+    for name, value in CACHE_SETTINGS.items():
+        if jax.config.values[name] != value:
+            jax.config.update(name, value)
 
 
 @pytest.fixture(autouse=True)

@@ -114,7 +114,6 @@ def kept_in(tmp_path):
     """A folder for programs of this process, of which it forgets all afterwards."""
     kept_programs.keep_in(tmp_path)
     yield tmp_path / "linkax"
-    kept_programs.keep_in(None)
     kept_programs._met.clear()
 
 

@@ -4,12 +4,10 @@ import re
 from itertools import chain
 from pathlib import Path
 
-import jax
 import matplotlib
 import pytest
 
 import linkax as lx
-from linkax.xla.kept_programs import keep_in
 
 SOURCE = Path(__file__).parents[1] / "notebooks"
 PAGES = sorted((*SOURCE.glob("*.md"), *SOURCE.glob("reference/*.md")))
@@ -33,20 +31,9 @@ def test_every_public_name_is_in_an_example_of_its_page():
     assert [name for page, names in DESCRIBED.items() for name in names if not shown(page, name)] == []
 
 
-@pytest.fixture
-def settings_kept():
-    """Those of JAX that `lx.cache_programs` changes, and that no programs are kept."""
-    names = [name for name in jax.config.values if "cache" in name]
-    before = {name: jax.config.values[name] for name in names}
-    yield
-    keep_in(None)
-    for name, value in before.items():
-        jax.config.update(name, value)
-
-
 @pytest.mark.filterwarnings("default:.*interactive")
 @pytest.mark.parametrize("page", [pytest.param(page, marks=mark(page)) for page in BLOCKS if BLOCKS[page]])
-def test_the_blocks_of_a_page_run(page, tmp_path, monkeypatch, settings_kept):
+def test_the_blocks_of_a_page_run(page, tmp_path, monkeypatch):
     """One after the other, as someone would who types them in."""
     matplotlib.use("agg")
     monkeypatch.chdir(tmp_path)
