@@ -270,5 +270,5 @@ def test_warnings_point_to_the_users_line():
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("kept")
     for folder in (tmp_path / "file", tmp_path / "file" / "below", "a\0b"):
-        with pytest.raises(ValueError, match=r"programs cannot be kept in folder .*give another folder"):
+        with pytest.raises(ValueError, match=r"cannot write to folder .*give another folder for programs"):
             lx.cache_programs(folder)

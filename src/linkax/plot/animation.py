@@ -62,7 +62,8 @@ def animate(
     figure, axes, actors = draw(scenery, dpi)
     frames = _filmed(figure, axes, actors, len(scenery.times))
     # One palette for all frames: colours do not flicker, and the file is small.
-    frames = [frame.quantize(palette=frames[0].quantize(128), dither=Image.Dither.NONE) for frame in frames]
+    palette = frames[0].quantize(128)
+    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     stream, duration = io.BytesIO(), 1000 // FRAMES_PER_SECOND
     frames[0].save(stream, format="GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
     animation = Animation(stream.getvalue())

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import tempfile
 import threading
 from functools import cache
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, cast
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from linkax.files import writable_folder
 from linkax.xla.kept_programs import FOUND, keep_in
 from linkax.xla.memory_maps import COMPILING
 from linkax.xla.users_line import warn
@@ -42,7 +42,7 @@ def cache_programs(folder: str | os.PathLike | None = None) -> str:
     """
     path = os.fspath(folder or cast(Any, jax.config).jax_compilation_cache_dir or _users_folder())
     if "://" not in path:
-        _check_writable(path)
+        writable_folder(Path(path), "give another folder for programs")
     jax.config.update("jax_compilation_cache_dir", path)
     # By default JAX keeps only what took a second to compile.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -60,16 +60,6 @@ def _users_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches" / "linkax"
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "linkax"
-
-
-def _check_writable(path):
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            return
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"programs cannot be kept in folder {path!r}: {reason}; give another folder") from error
 
 
 @cache
