@@ -5,7 +5,7 @@ from matplotlib.text import Text
 from linkax.plot.drawing import draw
 from linkax.plot.figure import Figure
 from linkax.scenery.colours import body_colour
-from linkax.scenery.scenery import Points, checked_points, scenery_of
+from linkax.scenery.scenery import Points, scenery_of
 from linkax.simulation.read.solution import Solution
 
 PALE = 0.3  # opacity of the mechanism behind the paths
@@ -26,9 +26,9 @@ def path(solution: Solution, points: Points) -> Figure:
 
     **Raises:** `ValueError` for no points, for points of another form, an unknown body, and the solution of a batch.
     """
-    if not checked_points(points):
-        raise ValueError(f"points is {points!r}; give at least one, {{name: (body, at)}}")
     scenery = scenery_of(solution, points)
+    if not scenery.curves:
+        raise ValueError(f"points is {points!r}; give at least one, {{name: (body, at)}}")
     figure, axes, actors = draw(scenery, DOTS_PER_INCH)
     for actor in actors:
         actor.move(0)

@@ -87,7 +87,7 @@ def scenery_of(solution: Solution, points: Points, times: Float[np.ndarray, " n_
 
     **Raises:** `ValueError` for the solution of a batch, one that holds no state, and points of another form.
     """
-    saved, points = reached(solution), checked_points(points)
+    saved, points = reached(solution), _checked_points(points)
     shown = saved if times is None else _between(saved, times)
     mechanism, moments = saved.mechanism, np.asarray(shown.ts)
     poses = {name: (np.asarray(origin), np.asarray(axes)) for name, (origin, axes) in shown.poses().items()}
@@ -101,7 +101,7 @@ def scenery_of(solution: Solution, points: Points, times: Float[np.ndarray, " n_
     return Scenery(mechanism, moments, poses, outlines, traced, curves, camera)
 
 
-def checked_points(points: Any) -> Points:
+def _checked_points(points: Any) -> Points:
     """Check that points are {name: (body, at)}."""
     form = "give {name: (body, at)}, such as {'P': ('coupler', 'tip')} or {'P': ('coupler', [0.4, 0.2, 0.0])}"
     for name, entry in require_type(points, Mapping, "points", form).items():
