@@ -30,8 +30,8 @@ def cache_programs(folder: str | os.PathLike | None = None) -> str:
     runs outside of JAX transformations, but where it has elements of one's own.
 
     **Arguments:** `folder`: may be shared by processes, and removed at any time; what is in it is run, so share it with
-    no one whom you do not trust; by default `JAX_COMPILATION_CACHE_DIR`
-    of the environment, or else `linkax` in the user's folder for caches.
+    no one whom you do not trust. By default it is `JAX_COMPILATION_CACHE_DIR` of the environment, or else `linkax` in
+    the user's folder for caches.
 
     **Returns:** the folder.
 
