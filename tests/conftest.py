@@ -28,6 +28,7 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import Phase, settings  # noqa: E402
+from jax.experimental.compilation_cache import compilation_cache  # noqa: E402
 
 # The same examples in each run; `--hypothesis-profile thorough` takes many others, and makes failing ones small.
 _quick = [Phase.explicit, Phase.generate]
@@ -85,9 +86,10 @@ def _programs_are_kept_no_longer():
     """Undo what `lx.cache_programs` changes, which the command line calls too; programs kept on disk run otherwise."""
     yield
     keep_in(None)
-    for name, value in CACHE_SETTINGS.items():
-        if jax.config.values[name] != value:
+    if changed := {name: value for name, value in CACHE_SETTINGS.items() if jax.config.values[name] != value}:
+        for name, value in changed.items():
             jax.config.update(name, value)
+        compilation_cache.reset_cache()  # which is open in the folder of the test
 
 
 @pytest.fixture(autouse=True)
