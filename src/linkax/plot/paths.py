@@ -6,13 +6,13 @@ from linkax.plot.drawing import draw
 from linkax.plot.figure import Figure
 from linkax.scenery.colours import body_colour
 from linkax.scenery.scenery import Points, scenery_of
-from linkax.simulation.read.solution import Solution
+from linkax.simulation.read.kinematics import Kinematics
 
 PALE = 0.3  # opacity of the mechanism behind the paths
 DOTS_PER_INCH = 100
 
 
-def path(solution: Solution, points: Points) -> Figure:
+def path(solution: Kinematics, points: Points) -> Figure:
     """Plot the paths of points in space, such as coupler curves, over the mechanism at the first saved time.
 
     ```python

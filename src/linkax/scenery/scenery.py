@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -21,8 +21,9 @@ from linkax.model.point_forces import Damper, Spring
 from linkax.model.ropes import ElasticRope, Rope
 from linkax.scenery.camera import Camera, camera_for
 from linkax.simulation.read.by_name import BodyPoint
-from linkax.simulation.read.solution import Solution
+from linkax.simulation.read.kinematics import Kinematics
 
+Moving = TypeVar("Moving", bound=Kinematics)
 Points = Mapping[str, tuple[str, BodyPoint]]  # {name of a point: its body, and where on it}
 CURVE_POINTS = 4  # of the path of a point, for each saved time
 
@@ -80,7 +81,7 @@ class Scenery(NamedTuple):
         return _box(_everything(self.poses, self.outlines, self.points))
 
 
-def scenery_of(solution: Solution, points: Points, times: Float[np.ndarray, " n_f"] | None = None) -> Scenery:
+def scenery_of(solution: Kinematics, points: Points, times: Float[np.ndarray, " n_f"] | None = None) -> Scenery:
     """Place a solution at its saved times, or at other times between them.
 
     **Arguments:** `points`: to trace.
@@ -110,7 +111,7 @@ def _checked_points(points: Any) -> Points:
     return points
 
 
-def reached(solution: Solution) -> Solution:
+def reached(solution: Moving) -> Moving:
     """The solution at the saved times that it reached.
 
     **Raises:** `ValueError` for the solution of a batch, and one that holds no state.
@@ -119,16 +120,19 @@ def reached(solution: Solution) -> Solution:
         raise ValueError("the solution saved functions of its own; draw one that saved its states")
     if np.ndim(solution.ts) != 1:
         raise ValueError(f"the solution is a batch of shape {np.shape(solution.ts)[:-1]}; draw one of its members")
-    there = np.isfinite(np.asarray(solution.ts))
-    if np.all(there):
+    times = np.asarray(solution.ts)
+    there = np.isfinite(times)
+    if np.all(there) and np.all(np.diff(times) > 0.0):
         return solution  # which keeps what was read of it
     if not np.any(there):
         raise ValueError("the solution has no time that was reached; there is nothing to draw")
-    kept = {name: np.asarray(getattr(solution, name))[there] for name in ("ts", "q", "v")}
+    kept = {name: np.asarray(getattr(solution, name))[there] for name in solution.by_time}
+    if not np.all(np.diff(kept["ts"]) > 0.0):
+        kept["ts"] = np.arange(float(len(kept["ts"])))  # a trace may go back
     return dataclasses.replace(solution, **kept)
 
 
-def _between(saved, moments) -> Solution:
+def _between(saved: Moving, moments) -> Moving:
     """The solution at other times, by Hermite interpolation of the joints' coordinates."""
     times, q, v = (np.asarray(values) for values in (saved.ts, saved.q, saved.v))
     left = np.clip(np.searchsorted(times, moments, side="right") - 1, 0, len(times) - 2)

@@ -17,6 +17,7 @@ import numpy as np
 from linkax.files import written_whole
 from linkax.model.numbers import require_type
 from linkax.scenery.scenery import Points, reached, scenery_of
+from linkax.simulation.read.kinematics import Kinematics
 from linkax.simulation.read.solution import Solution
 from linkax.view.contents import contents
 
@@ -57,7 +58,7 @@ class View:
 
 
 def view(
-    solution: Solution,
+    solution: Kinematics,
     path: str | os.PathLike | None = None,
     *,
     points: Points | None = None,
@@ -69,15 +70,23 @@ def view(
     stride = max(1, -(-7 * bodies * len(saved.ts) // MOST_NUMBERS))
     shown = np.unique([*range(0, len(saved.ts), stride), len(saved.ts) - 1])
     scenery = scenery_of(saved, points or {}, None if stride == 1 else np.asarray(saved.ts)[shown])
-    arrows = {}
-    for name in _asked(saved, reactions):
-        force = np.asarray(saved.reaction(name).force)[shown]
-        joint = saved.mechanism.joint(name)
-        arrows[f"{name}: force on {joint.child.body}"] = joint.child, np.where(np.isfinite(force), force, 0.0)
-    page = View(_page(*contents(scenery, arrows)))
+    page = View(_page(*contents(scenery, _arrows(saved, reactions, shown))))
     if path is not None:
         page.save(path)
     return page
+
+
+def _arrows(saved, reactions, shown):
+    """{label: where a force acts, and its vectors at the times shown}."""
+    if not isinstance(saved, Solution):
+        if reactions:
+            raise ValueError("a trace has no forces; leave reactions out, or show those of a solution")
+        return {}
+    arrows = {}
+    for name in _asked(saved, reactions):
+        force, joint = np.asarray(saved.reaction(name).force)[shown], saved.mechanism.joint(name)
+        arrows[f"{name}: force on {joint.child.body}"] = joint.child, np.where(np.isfinite(force), force, 0.0)
+    return arrows
 
 
 def _asked(saved, reactions) -> list[str]:

@@ -33,6 +33,8 @@ FEW = 1.5e7  # times of all members, times the square of unknowns: reading more,
 
 def read_in_motion(function: Callable[..., Any], solution: Solution, *details: Any) -> Any:
     """Read a function that needs v̇ or λ: these are solved by one program for all such functions, and passed in."""
+    if (known := solution.known_dynamics) is not None:
+        return read(function, solution, *details, dynamics=known)
     flat = solution.run.flat
     if solution.q is not None and all_concrete(solution) and is_first(function, flat.tree.topology, flat.noted):
         with compiling(), ThreadPoolExecutor() as threads:

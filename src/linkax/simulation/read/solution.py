@@ -1,8 +1,7 @@
 """The motion that a simulation found, and what can be read from it."""
 
-import os
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,13 +11,11 @@ from jaxtyping import Float, Int
 
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.formulations.formulation import AbstractFormulation
-from linkax.model.beams import Beam
 from linkax.model.elements import AbstractElement
 from linkax.model.joints.distance import Distance
 from linkax.model.mechanism import Mechanism
 from linkax.model.names import ByName
 from linkax.model.numbers import Number, number, require
-from linkax.model.poses import Pose
 from linkax.simulation.explain.error_estimate import refined_run
 from linkax.simulation.explain.remarks import remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
@@ -27,16 +24,12 @@ from linkax.simulation.integrate.options import check_accuracy
 from linkax.simulation.integrate.results import REMARKS, RESULTS
 from linkax.simulation.integrate.run import Run, checked_formulation
 from linkax.simulation.read.by_name import (
-    BodyPoint,
     force_of,
     is_constraint,
-    length_of,
-    of_body,
     of_constraint,
-    of_joint,
-    of_point,
     reaction_of,
 )
+from linkax.simulation.read.kinematics import Kinematics
 from linkax.simulation.read.observables import Observables, Power, Violation
 from linkax.simulation.read.passages import Passages, passages
 from linkax.simulation.read.reading import evaluate_dense, kept, read, read_in_motion
@@ -49,14 +42,9 @@ from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete, jit_inline
 
-if TYPE_CHECKING:
-    from linkax.view import View
-else:
-    View = Any  # of a higher layer
-
 
 @printed_as(summary)
-class Solution(eqx.Module):
+class Solution(Kinematics):
     """A motion at the times `ts` [s].
 
     - `run`: what was integrated, and how; its `mechanism`, `formulation` and `accuracy` are the solution's own.
@@ -91,11 +79,6 @@ class Solution(eqx.Module):
     average: Float[Array, "*batch"] | np.floating
     definiteness: Float[Array, "*batch"] | np.floating
     interpolation: Any
-
-    @property
-    def mechanism(self) -> Mechanism:
-        """The mechanism that moved."""
-        return self.run.mechanism
 
     @property
     def accuracy(self) -> Accuracy:
@@ -164,59 +147,6 @@ class Solution(eqx.Module):
             definiteness=jnp.ones((), state.q.dtype),
             interpolation=None,
         )
-
-    def position(self, body: str, at: BodyPoint = None) -> Float[Array, "*batch n_t 3"]:
-        """Position of a body's centre of mass, or of the point `at` on it [m].
-
-        `at`: the name of one of the body's frames, or [x, y, z] in its reference frame [m]. On a beam,
-        "base", "tip", a distance along the axis [m], or [x, y, z] off it.
-        """
-        return of_point(Observables.position, self, body, at)
-
-    def velocity(self, body: str, at: BodyPoint = None) -> Float[Array, "*batch n_t 3"]:
-        """Velocity of a body's centre of mass, or of the point `at` on it [m/s]."""
-        return of_point(Observables.velocity, self, body, at)
-
-    def acceleration(self, body: str, at: BodyPoint = None) -> Float[Array, "*batch n_t 3"]:
-        """Acceleration of a body's centre of mass, or of the point `at` on it [m/s²]."""
-        return of_point(Observables.acceleration, self, body, at)
-
-    def orientation(self, body: str) -> Float[Array, "*batch n_t 3 3"]:
-        """Axes of a body's reference frame, as columns."""
-        return of_body(Observables.orientation, self, body)
-
-    def angular_velocity(self, body: str) -> Float[Array, "*batch n_t 3"]:
-        """Angular velocity of a body [rad/s]."""
-        return of_body(Observables.angular_velocity, self, body)
-
-    def angular_acceleration(self, body: str) -> Float[Array, "*batch n_t 3"]:
-        """Angular acceleration of a body [rad/s²]."""
-        return of_body(Observables.angular_acceleration, self, body)
-
-    def poses(self) -> dict[str, Pose]:
-        """Reference frames of all bodies by name, of a beam those of its sections: what an animation needs."""
-        origin, axes = read(Observables.poses, self)
-        names = enumerate(self.mechanism.topology.bodies)
-        return ByName({name: Pose(origin[..., index, :], axes[..., index, :, :]) for index, name in names}, "body")
-
-    def joint(self, name: str) -> Float[Array, "..."]:
-        """Coordinate of a joint, in the tree or cut [rad or m]; (n_t, n) where it has several."""
-        return of_joint(Observables.joint, self, name)
-
-    def joint_speed(self, name: str) -> Float[Array, "..."]:
-        """Speed of a joint, in the tree or cut [rad/s or m/s]."""
-        return of_joint(Observables.joint_speed, self, name)
-
-    def joint_acceleration(self, name: str) -> Float[Array, "..."]:
-        """Rate of a joint's speed, in the tree or cut [rad/s² or m/s²]."""
-        return of_joint(Observables.joint_acceleration, self, name)
-
-    def strain(self, beam: str) -> Float[Array, "*batch n_t n 6"]:
-        """Strains of a beam at its nodes: twist, curvatures about y and z [rad/m], stretch, shear along y and z."""
-        found = self.mechanism.body(beam)
-        if not isinstance(found, Beam):
-            raise ValueError(f"body {beam!r} is no beam, and has no strain")
-        return found.strain(self.joint(beam))
 
     def reaction(self, name: str, *, on: Side = "child", axes: Axes = "ground") -> Any:
         """The reaction of a joint, or the force of a constraint.
@@ -305,10 +235,6 @@ class Solution(eqx.Module):
         """
         return force_of(self, element)
 
-    def length(self, element: str | AbstractElement | Distance) -> Float[Array, "*batch n_t"]:
-        """Length of a `Spring`, `Damper`, `ElasticRope`, `Rope` or `Distance` [m]; see `force`."""
-        return length_of(self, element)
-
     def violation(self) -> Violation:
         """Largest violation of the loop rows at each time."""
         return read_in_motion(Observables.violation_and_scales, self)[0]
@@ -321,14 +247,6 @@ class Solution(eqx.Module):
         acceleration, since uniform motion of the joints accelerates the bodies.
         """
         return _worst(self.ts, *read_in_motion(Observables.violation_and_scales, self))
-
-    def rank(self) -> Int[Array, "*batch n_t"]:
-        """Number of independent loop rows."""
-        return read(Observables.rank_and_distance, self)[0]
-
-    def singularity_distance(self) -> Float[Array, "*batch n_t"]:
-        """Distance d from the nearest singular configuration, see `linkax.Accuracy`."""
-        return read(Observables.rank_and_distance, self)[1]
 
     def error_estimate(self, reading: "Callable[[Solution], Any] | None" = None, *, factor: Number = 1e-2) -> Any:
         """How far this run is off, found by a second one that is more accurate.
@@ -362,32 +280,6 @@ class Solution(eqx.Module):
         took many steps, and inside of JAX transformations always, which compiles longer: better return the `Solution`.
         """
         return remark(self)
-
-    def view(
-        self,
-        path: str | os.PathLike | None = None,
-        *,
-        points: Mapping[str, tuple[str, BodyPoint]] | None = None,
-        reactions: bool | list[str] = False,
-    ) -> View:
-        """Show the motion in three dimensions, in any browser or in a notebook.
-
-        The page needs no network. It turns, zooms and plays; names show where the pointer is. Bodies are drawn
-        through their joints and named frames, or by their shape, see `linkax.RigidBody`.
-
-        **Arguments:**
-
-        - `path`: an HTML file to write.
-        - `points`: {name: (body, at)} of points to label and trace, see `position`.
-        - `reactions`: joints whose forces on their children are shown as arrows, or `True` for all.
-
-        **Returns:** a `View`: the value of a notebook cell, or `solution.view().show()` for the browser.
-
-        **Raises:** `ValueError` for the solution of a batch, and for an unknown name.
-        """
-        from linkax.view import view
-
-        return view(self, path, points=points, reactions=reactions)
 
     def passages(self) -> Passages:
         """Times at which the motion goes through singular configurations, and the digits lost.
