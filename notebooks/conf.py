@@ -35,9 +35,19 @@ READ = {"Frame", "Load", "Mobility", "Motion", "Solution", "View"}
 WRITTEN = {"Inertia", "Pose", "Stepping", "Velocity"}
 # Classes whose methods users call; those of others are for linkax, as it moves joints and adds up forces.
 CALLED = {"AbstractForce", "Beam", "Fit", "Linearisation", "Mechanism", "Mobility", "Motion", "RigidBody", "Solution"}
-CALLED |= {"Sweep", "View"}
+CALLED |= {"Sweep", "Trace", "View", "Workspace"}
 # What linkax itself calls of them.
-INTERNAL = {"of_run", "another", "joint_speeds", "cut_speeds", "joint_rate", "point_bias", "within", "element_length"}
+INTERNAL = {
+    "of_run",
+    "another",
+    "known_dynamics",
+    "joint_speeds",
+    "cut_speeds",
+    "joint_rate",
+    "point_bias",
+    "within",
+    "element_length",
+}
 INTERNAL |= {"fastest_frequency", "nodes", "sections", "section_name", "needs_coordinate", "display_name"}
 INTERNAL |= {"conserves_energy", "switched", "side", "applied"}
 
@@ -49,7 +59,7 @@ def described(name):
         return False
     thing = getattr(lx, first)
     if inspect.isclass(thing):
-        entry = vars(thing).get(rest)
+        entry = next((vars(kind)[rest] for kind in thing.__mro__ if rest in vars(kind)), None)
         return not rest or (first in CALLED and (inspect.isroutine(entry) or isinstance(entry, property)))
     return not rest or (inspect.ismodule(thing) and hasattr(thing, rest))
 
@@ -62,7 +72,7 @@ def directives(names):
             yield f".. autoexception:: linkax.{name}()"
         elif inspect.isclass(thing):
             yield f".. autoclass:: linkax.{name}"
-            yield from ["   :members:"] if name in CALLED else []
+            yield from ["   :members:", "   :inherited-members: Module"] if name in CALLED else []
             yield from ["   :class-doc-from: both"] if name == "AbstractJoint" else []  # its arguments are all joints'
         elif inspect.isroutine(thing):
             yield f".. autofunction:: linkax.{name}"

@@ -28,7 +28,12 @@ from linkax.analysis.inverse_dynamics import inverse_dynamics as inverse_dynamic
 from linkax.analysis.linearisation import Linearisation as Linearisation  # noqa: E402
 from linkax.analysis.mobility import Mobility as Mobility  # noqa: E402
 from linkax.analysis.mobility import mobility as mobility  # noqa: E402
+from linkax.analysis.trace import Trace as Trace  # noqa: E402
+from linkax.analysis.trace import TraceError as TraceError  # noqa: E402
+from linkax.analysis.trace import trace as trace  # noqa: E402
 from linkax.analysis.vibration import linearise as linearise  # noqa: E402
+from linkax.analysis.workspace import Workspace as Workspace  # noqa: E402
+from linkax.analysis.workspace import workspace as workspace  # noqa: E402
 from linkax.equations.motion import Motion as Motion  # noqa: E402
 from linkax.equations.reactions import Reaction as Reaction  # noqa: E402
 from linkax.formulations.augmented_lagrangian import AugmentedLagrangian as AugmentedLagrangian  # noqa: E402

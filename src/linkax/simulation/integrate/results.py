@@ -45,6 +45,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  Equ
         "of what it can be, such as a negative length; give finite ones. Outside of JAX transformations such a "
         "mechanism is refused, by an error that names the number."
     )
+    not_reached = "The branch does not lead to all values: it turns back before, or ends where another one crosses."
 
 
 KNOWN_RESULTS = (
@@ -60,6 +61,7 @@ KNOWN_RESULTS = (
     "massless",
     "not_finite",
     "times_out_of_order",
+    "not_reached",
 )
 
 
