@@ -272,3 +272,15 @@ def test_beams_are_strained_with_the_least_energy():
     force = jax.jit(jax.vmap(jax.grad(strained_energy)))(at)
     np.testing.assert_allclose(energy(at)[0], 3.0 * at[0] ** 2 / 16.0, rtol=1e-4)
     np.testing.assert_allclose(force, (energy(at + step) - energy(at - step)) / (2.0 * step), rtol=1e-6)
+
+
+def test_in_a_batch_the_result_tells_of_a_state_that_was_not_found():
+    """A crank of one metre that stands upright, and rods of which one is too short."""
+
+    def reached(rod):
+        mechanism = crank_slider(rod=rod)
+        return lx.Solution.of_state(mechanism, lx.assemble(mechanism, {"bearing": 0.5 * np.pi})).result
+
+    found = lx.sweep(lambda rod: {"result": reached(rod), "rod": rod}, jnp.array([1.3, 0.8, 1.1]), progress=False)
+    assert found.count() == {"successful": 2, "not_assembled": 1}
+    assert "cannot be closed" in found.failed[1]

@@ -35,6 +35,7 @@ from linkax.simulation.read.passages import Passages, passages
 from linkax.simulation.read.reading import evaluate_dense, kept, read, read_in_motion
 from linkax.simulation.read.summary import summary
 from linkax.simulation.read.work import work
+from linkax.simulation.start.initial_state import is_assembled
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
 from linkax.tables import printed_as
@@ -124,13 +125,18 @@ class Solution(Kinematics):
         accuracy: Accuracy = BALANCED,
         formulation: str | AbstractFormulation | None = None,
     ) -> "Solution":
-        """A solution of one time, to read reactions, energies or accelerations at a `State` on the closed loops."""
+        """A solution of one time, to read reactions, energies or accelerations at a `State` on the closed loops.
+
+        Inside JAX transformations, its `result` tells of a state that `linkax.assemble` did not find.
+        """
         state = checked_state(mechanism, state)
         check_accuracy(accuracy)
         t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
         result: Any = RESULTS.successful
         if not concrete(sound := sound_numbers(mechanism)):
             result = RESULTS.where(sound, result, RESULTS.not_finite)
+        if concrete(state.v) is None:
+            result = RESULTS.where(is_assembled(state) | jnp.logical_not(sound), result, RESULTS.not_assembled)
         return Solution(
             run=Run.of_state(mechanism, state, t, checked_formulation(formulation, accuracy), accuracy),
             ts=t[None],

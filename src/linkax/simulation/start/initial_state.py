@@ -59,6 +59,11 @@ class InitialCheck(NamedTuple):
         return self._replace(finite=self.finite & sound, assembled=self.assembled | jnp.logical_not(sound))
 
 
+def is_assembled(state: State) -> Bool[Array, ""]:
+    """False for a state that `linkax.assemble` did not find, inside a JAX transformation."""
+    return jnp.logical_not(jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isposinf(state.v)) & (len(state.v) > 0))
+
+
 def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""], state: State) -> InitialCheck:
     """Close a state and find the rank of J beside it along the motion.
 
@@ -74,7 +79,6 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
     found = _at_start(method, system, t, q, v)
     eps = jnp.finfo(system.dtype).eps
     massive = found.definiteness > SINGULAR_ULPS * eps * len(v)
-    assembled = jnp.logical_not(jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isposinf(state.v)) & (len(state.v) > 0))
     finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & jnp.all(jnp.isfinite(found.mass))
     finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, found.acceleration, 0.0)))
     return InitialCheck(
@@ -85,7 +89,7 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
         if system.topology.num_rows == 0
         else ranks_along(method, system, t, q, found.direction, found.rank),
         definiteness=found.definiteness,
-        assembled=assembled,
+        assembled=is_assembled(state),
         finite=finite,
         massive=massive,
         closed=found.gap <= jnp.sqrt(eps),
