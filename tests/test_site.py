@@ -17,7 +17,8 @@ LISTS = {page: " ".join(re.findall(r"```\{api\}\n(.*?)```", text, re.DOTALL)) fo
 BY_HAND = {page: re.findall(r"\.\. py:data:: linkax\.(\w+)", text) for page, text in TEXTS.items()}
 DESCRIBED = {page: [*LISTS[page].split(), *BY_HAND[page]] for page in TEXTS}
 
-SLOW = ("reference/derivatives", "reference/formulations", "reference/beams")  # minutes of compiling
+# Minutes of compiling.
+SLOW = ("reference/derivatives", "reference/tolerances", "reference/formulations", "reference/beams")
 mark = lambda page: [pytest.mark.slow] if page in SLOW else []
 
 

@@ -126,6 +126,11 @@ from linkax.studies.shooting import Shots as Shots  # noqa: E402
 from linkax.studies.shooting import shoot as shoot  # noqa: E402
 from linkax.studies.sweep import sweep as sweep  # noqa: E402
 from linkax.studies.sweep_result import Sweep as Sweep  # noqa: E402
+from linkax.studies.tolerance_analysis import tolerance_analysis as tolerance_analysis  # noqa: E402
+from linkax.studies.tolerance_result import SobolIndices as SobolIndices  # noqa: E402
+from linkax.studies.tolerance_result import Statistics as Statistics  # noqa: E402
+from linkax.studies.tolerance_result import ToleranceAnalysis as ToleranceAnalysis  # noqa: E402
+from linkax.studies.tolerance_result import ToleranceSamples as ToleranceSamples  # noqa: E402
 from linkax.xla.program_cache import cache_programs as cache_programs  # noqa: E402
 
 if _TYPE_CHECKING:
