@@ -31,28 +31,14 @@ def four_bar(lengths):
     return lx.Mechanism([crank, coupler, rocker], joints)
 
 
-def drawn_angles(crank_angles):
-    """Angles of rocker and crank pin as drawn, in closed form, which choose the assembly mode."""
-    a, b, c, d = LENGTHS.values()
-    pin = a * np.exp(1j * crank_angles)
-    reach = pin - d
-    rocker = np.angle(reach) - np.arccos((np.abs(reach) ** 2 + c**2 - b**2) / (2.0 * c * np.abs(reach)))
-    return rocker, np.angle((d + c * np.exp(1j * rocker) - pin) / np.exp(1j * crank_angles))
-
-
 def path(crank_angles):
-    """A function of lengths -> the path, and whether the four-bar can be assembled along it."""
-    guesses = drawn_angles(crank_angles)
+    """A function of lengths -> the path, and whether the four-bar can be assembled and goes along it."""
 
     def of(lengths):
         mechanism = four_bar(lengths)
-
-        def at(angle, rocker, pin):
-            guess = {"rocker_bearing": rocker, "crank_pin": pin}
-            here = lx.Solution.of_state(mechanism, lx.assemble(mechanism, {"crank_bearing": angle}, guess=guess))
-            return {"point": here.position("coupler", at=[0.55, 0.3, 0.0])[0, :2], "result": here.result}
-
-        return jax.vmap(at)(crank_angles, *guesses)
+        start = lx.assemble(mechanism, {"crank_bearing": 0.0}, guess={"rocker_bearing": 1.5})
+        turn = lx.trace(mechanism, start, {"crank_bearing": crank_angles})
+        return {"point": turn.position("coupler", at=[0.55, 0.3, 0.0])[:, :2], "result": turn.result}
 
     return of
 

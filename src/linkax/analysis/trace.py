@@ -243,6 +243,7 @@ def _traced(flat, start, course, t):
     result = RESULTS.where(jnp.all(reached), *ENDS)
     result = RESULTS.where(closed, result, RESULTS.not_closed)
     result = RESULTS.where(sound, result, RESULTS.not_finite)
+    result = RESULTS.where(jnp.any(jnp.isinf(start.v)), RESULTS.not_assembled, result)
     return [*map(there, (course.s, *place[:4]))], result
 
 
