@@ -1,4 +1,4 @@
-"""A sweep of pendulums in a process of its own: `sweep_job.py STORE|- RESULT [PROCESS COUNT PORT]`.
+"""A sweep of pendulums in a process of its own: `sweep_job.py STORE|- RESULT [PROCESS COUNT PORT | mpi CHUNK]`.
 
 Pendulums of lengths that differ; one length is no number, and one motion takes more steps than are allowed.
 """
@@ -38,12 +38,17 @@ def batch(t1=1.0):
 
 def main():
     store, result, *job = sys.argv[1:]
-    if job:
+    options = {"chunk": CHUNK, "store": None if store == "-" else store, "progress": True}
+    if job[:1] == ["mpi"]:
+        from mpi4py.futures import MPIPoolExecutor
+
+        options |= {"chunk": int(job[1]), "executor": MPIPoolExecutor()}
+    elif job:
         process, count, port = map(int, job)
         jax.distributed.initialize(f"localhost:{port}", count, process)
     import linkax as lx
 
-    found = lx.sweep(swing, batch(), chunk=CHUNK, store=None if store == "-" else store, progress=True)
+    found = lx.sweep(swing, batch(), **options)
     np.savez(result, angle=found.output["angle"], reasons=found.reasons)
 
 

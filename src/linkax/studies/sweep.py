@@ -1,11 +1,9 @@
 """Evaluate one function for many sets of parameters."""
 
-import concurrent.futures
-import itertools
 import numbers
 import os
-import time
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
 from typing import Any, cast
 
 import equinox as eqx
@@ -19,9 +17,11 @@ from linkax.model.numbers import real, require_type, whole_number
 from linkax.simulation.integrate.results import REMARKS, WARNINGS
 from linkax.simulation.read.solution import Solution
 from linkax.studies.parameters import as_arrays
-from linkax.studies.sweep_program import SweepProgram, is_struct
-from linkax.studies.sweep_result import FINE, NOT_RUN, Sweep
+from linkax.studies.sweep_program import Plan, SweepProgram, is_struct
+from linkax.studies.sweep_result import NOT_RUN, Sweep
+from linkax.studies.sweep_run import Threads, Workers, run_sweep
 from linkax.studies.sweep_store import SweepStore
+from linkax.studies.sweep_workers import Work, check_executor
 from linkax.xla.enumerations import code, is_item, item
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import Progress, compiling
@@ -40,8 +40,9 @@ def sweep(
     difficulty: Callable | ArrayLike | Sequence[float] | None = None,
     store: str | os.PathLike | None = None,
     progress: bool | None = None,
+    executor: Executor | Any = None,
 ) -> Sweep:
-    """Evaluate a function for each set of parameters of a batch: compiled once, in chunks, on all devices.
+    """Evaluate a function for each set of parameters of a batch: compiled once, in chunks, on all devices or workers.
 
     Members are independent: one that fails is marked, and changes no other. Why a member failed is known where the
     function returns a `Solution`, or a `solution.result` beside its outputs; else outputs that are not finite count as
@@ -63,11 +64,18 @@ def sweep(
       there; damaged results are computed again; the store of another function or other parameters is refused.
       Processes that run the same sweep may share it.
     - `progress`: whether to show a progress bar; by default where the output is a terminal.
+    - `executor`: any `concurrent.futures.Executor` that starts no process by fork, such as Dask's
+      `client.get_executor()` or mpi4py's `MPIPoolExecutor`, or one of submitit's. Its workers compute one chunk in each
+      task, on the first device of their process, and compile once each; all of them share the folder of
+      `linkax.cache_programs`. What lost workers had goes to others, and workers may join. Numbers are bit for bit those
+      of one process with the same chunk, on a like machine. The function is sent by cloudpickle, where that is
+      installed.
 
     **Returns:** a `Sweep`.
 
-    **Raises:** `ValueError` for params without a common leading axis, for a store of another sweep, and for a folder
-    in which no store can be.
+    **Raises:** `ValueError` for params without a common leading axis, for a store of another sweep, for a folder in
+    which no store can be, and for an executor that cannot run it. `RuntimeError` for a task that fails three times,
+    which names its members, and for workers with other versions; a store keeps what has been computed.
 
     **Warns:** of damage in a store, and (`AccuracyWarning`, `StiffnessWarning`) of the number of members with each
     remark, see `Sweep.remarks`.
@@ -75,6 +83,9 @@ def sweep(
     require_type(function, Callable, "function", "give a function of one set of parameters")
     params = as_arrays(params, "params")
     count = _members(params)
+    if executor is not None:
+        check_executor(executor, devices)
+    options = dict(chunk=chunk, memory=memory, devices=devices, executor=executor)
     devices = _checked_devices(devices)
     _check_sizes(chunk, memory)
     folder = None
@@ -83,24 +94,32 @@ def sweep(
         SweepStore.check("params", params)
     with Progress(count, "member", progress) as line:
         one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), params)
+        work = None if executor is None else Work.of(function, one)
         with compiling():
             shape = eqx.filter_eval_shape(function, one)
+        outputs, static = eqx.partition(shape, is_struct)
         if folder is not None:
-            SweepStore.check("output", eqx.filter(shape, is_struct))
-        order = _order(difficulty, params, count, dict(chunk=chunk, memory=memory, devices=devices))
+            SweepStore.check("output", outputs)
+        order = _order(difficulty, params, count, options)
+        chunk = chunk or min(DEFAULT_CHUNK, count)
         with compiling():
-            program = SweepProgram.compiled(function, one, shape, chunk or min(DEFAULT_CHUNK, count), memory, devices)
-        kept = None if folder is None else SweepStore.opened(folder, program, params, order, NOT_RUN)
-        results, seconds, ran = _run(program, params, order, kept, line)
-    arrays, reasons = results if jax.process_count() == 1 else _gathered(results)
+            if work is None:
+                program = SweepProgram.compiled(function, one, chunk, memory, devices)
+                engine, size, fingerprint = Threads(program), program.size, program.fingerprint
+            else:
+                engine, size, fingerprint = Workers.planned(executor, work, chunk, memory)
+        plan = Plan(size, outputs, fingerprint)
+        kept = None if folder is None else SweepStore.opened(folder, plan, params, order, NOT_RUN)
+        arrays, seconds, ran = run_sweep(engine, plan, params, order, kept, line)
     back = np.argsort(order)
-    output = eqx.combine(jax.tree.map(lambda array: array[back], arrays), program.static)
+    reasons, *leaves = (array[back] for array in (arrays if jax.process_count() == 1 else _gathered(arrays)))
+    output = eqx.combine(jax.tree.unflatten(jax.tree.structure(outputs), leaves), static)
     remarks = _remarks(output, count)
     for name, category in WARNINGS.items():
         if number := np.sum(code(remarks) == code(getattr(REMARKS, name))):
             told = f"{number} of {count} members: {REMARKS[getattr(REMARKS, name)]} Sweep.remarked tells which."
             warn(told, category)
-    return Sweep(output, reasons[back], seconds / ran if ran else float("nan"), remarks)
+    return Sweep(output, reasons, seconds / ran if ran else float("nan"), remarks)
 
 
 def _check_sizes(chunk, memory: int | float):
@@ -154,59 +173,8 @@ def _order(difficulty, params, count, options):
     return np.argsort(-np.nan_to_num(difficulty, nan=np.inf), kind="stable")
 
 
-def _run(program, params, order, kept, line):
-    """(outputs, reasons) in the order of running, the time that it took [s], and the number of members that ran."""
-    count = len(order)
-    starts = range(0, count, program.size)
-    own = starts[jax.process_index() :: jax.process_count()]
-    results = jax.tree.map(lambda info: np.zeros((count, *info.shape[1:]), info.dtype), program.outputs)
-    reasons = results[1]
-    reasons[:] = NOT_RUN
-    done = set() if kept is None else kept.load(results)
-    params = jax.tree.map(np.asarray, params)
-
-    def compute(start):
-        members = order[np.minimum(np.arange(start, start + program.size), count - 1)]
-        values = jax.tree.map(lambda leaf: leaf[members], params)
-        return start, jax.tree.map(np.asarray, program.run(values))
-
-    failed = int(np.sum(~np.isin(reasons, [*FINE, NOT_RUN])))
-    finished = sum(min(program.size, count - start) for start in done)
-    left = [start for start in own if start not in done]
-    began, ran = time.perf_counter(), 0
-    for start, computed in _in_parallel(compute, left, program.workers):
-        part = slice(start, min(start + program.size, count))
-        computed = jax.tree.map(lambda array, part=part: array[: part.stop - part.start], computed)
-        for whole, piece in zip(jax.tree.leaves(results), jax.tree.leaves(computed), strict=True):
-            whole[part] = piece
-        if kept is not None:
-            kept.save(start, part, computed)
-        ran += part.stop - part.start
-        failed += int(np.sum(~np.isin(reasons[part], FINE)))
-        line.tell("sweeping", finished + ran, f", {failed} failed" if failed else "")
-    elapsed = time.perf_counter() - began
-    if kept is not None and jax.process_count() > 1:
-        multihost_utils.sync_global_devices("sweep")
-    return results, elapsed, ran
-
-
-def _in_parallel(compute, items, workers):
-    """Yield results of a number of threads as they come; at most one chunk waits for each thread."""
-    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-        queue, running = iter(items), set()
-        while True:
-            running |= {pool.submit(compute, item) for item in itertools.islice(queue, 2 * workers - len(running))}
-            if not running:
-                return
-            finished, running = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
-            for future in finished:
-                yield future.result()
-
-
-def _gathered(results):
+def _gathered(arrays):
     """Gather the results of all processes in each of them."""
-    own = results[1] != NOT_RUN
-    (arrays, reasons), owns = multihost_utils.process_allgather((results, own))
+    stacked, owns = multihost_utils.process_allgather((arrays, arrays[0] != NOT_RUN))
     whose = np.argmax(owns, axis=0)
-    pick = lambda stacked: stacked[whose, np.arange(len(whose))]
-    return jax.tree.map(pick, arrays), pick(reasons)
+    return [array[whose, np.arange(len(whose))] for array in stacked]

@@ -11,22 +11,33 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from linkax.simulation.integrate.results import KNOWN_RESULTS, RESULTS
+from linkax.studies.fingerprint import fingerprint
 from linkax.studies.sweep_result import FINE, NOT_FINITE_OUTPUT, REASONS
 from linkax.xla.enumerations import code, is_item
 
 
-class SweepProgram(NamedTuple):
-    """The function, compiled for `size` members at once.
+class Plan(NamedTuple):
+    """What is known of a program, wherever it runs.
 
-    - `outputs`: shapes of its arrays. `static`: the part of its output that is no array.
-    - `text`: of the program before compilation, the same for the same function.
+    - `size`: members that it computes together. `outputs`: shapes of one member's arrays.
+    - `fingerprint`: of its text before compilation, the same for the same function.
+    """
+
+    size: int
+    outputs: Any
+    fingerprint: str
+
+
+class SweepProgram(NamedTuple):
+    """The function, compiled for `size` members at once: a batch of params -> (outputs, reasons).
+
+    - `fingerprint`: see `Plan`. `calls_lapack`: whether it calls LAPACK for batches.
     """
 
     run: Callable
     size: int
-    outputs: Any
-    static: Any
-    text: str
+    fingerprint: str
+    calls_lapack: bool
 
     @property
     def workers(self) -> int:
@@ -37,27 +48,25 @@ class SweepProgram(NamedTuple):
         """
         if jax.default_backend() != "cpu":
             return 2  # one is computed while the results of another are copied
-        return 1 if _calls_lapack_for_batches(self.text) else _cores()
+        return 1 if self.calls_lapack else _cores()
 
     @staticmethod
-    def compiled(
-        function: Callable, one: Any, shape: Any, chunk: int, memory: int | float, devices: list
-    ) -> "SweepProgram":
-        """Compile for parameters of one member like `one`, and an output like `shape`, in no more than `memory`."""
-        static = eqx.partition(shape, is_struct)[1]
+    def compiled(function: Callable, one: Any, chunk: int, memory: int | float, devices: list) -> "SweepProgram":
+        """Compile for parameters of one member like `one`, in no more than `memory`."""
         while True:
             size = chunk * len(devices)
             batch = jax.tree.map(lambda leaf, size=size: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), one)
             with jax.default_device(devices[0]):
                 lowered = jax.jit(_spread(jax.vmap(_member(function)), devices)).lower(batch)
                 text = lowered.as_text()
-                if len(devices) > 1 and devices[0].platform == "cpu" and _calls_lapack_for_batches(text):
+                calls_lapack = _calls_lapack_for_batches(text)
+                if len(devices) > 1 and devices[0].platform == "cpu" and calls_lapack:
                     devices = devices[:1]
                     continue
                 run = lowered.compile()
             used = _memory(run)
             if used <= memory or chunk == 1:
-                return SweepProgram(run, size, lowered.out_info, static, text)
+                return SweepProgram(run, size, fingerprint(text, []), calls_lapack)
             chunk = max(1, int(0.9 * chunk * memory / used))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from linkax.files import synced, writable_folder, written_whole
 from linkax.studies.fingerprint import fingerprint
 from linkax.studies.paths import path_parts
-from linkax.studies.sweep_program import SweepProgram
+from linkax.studies.sweep_program import Plan
 from linkax.xla.users_line import warn
 
 FORMAT = 2
@@ -66,35 +66,34 @@ class SweepStore(NamedTuple):
                 raise ValueError(f"{what} has type {leaf.dtype}, unknown to Zarr; use float32 or int32, or no store")
 
     @staticmethod
-    def opened(path: Path, program: SweepProgram, params: Any, order: np.ndarray, not_run: int) -> "SweepStore":
+    def opened(path: Path, plan: Plan, params: Any, order: np.ndarray, not_run: int) -> "SweepStore":
         """Open the store in a folder, or make a new one, whose reasons are all `not_run`.
 
         **Raises:** `ValueError` where the folder holds another sweep.
         """
         import zarr  # which takes its time, here and below
 
-        sweep = fingerprint(program.text, [*jax.tree.leaves(params), order])
-        identity = dict(format=FORMAT, members=len(order), chunk=program.size, sweep=sweep)
-        files = _known_files(identity, program, params, order, not_run)
+        sweep = fingerprint(plan.fingerprint, [*jax.tree.leaves(params), order])
+        identity = dict(format=FORMAT, members=len(order), chunk=plan.size, sweep=sweep)
+        files = _known_files(identity, plan, params, order, not_run)
         _claim(path, identity, files["zarr.json"])
         _mend(path, files)
         # A chunk that is not there is then none that is empty.
         with zarr.config.set({"array.write_empty_chunks": True}):
             group = zarr.open_group(path, mode="r+", use_consolidated=False)
-            arrays = tuple(group[name] for name in ["reason", *_names("output", program.outputs[0])])
+            arrays = tuple(group[name] for name in ["reason", *_names("output", plan.outputs)])
             done = group["done"]
             assert isinstance(done, zarr.Array)
-            return SweepStore(path, sweep, program.size, done, arrays)
+            return SweepStore(path, sweep, plan.size, done, arrays)
 
-    def load(self, results: tuple[Any, np.ndarray]) -> set[int]:
-        """Read the chunks that are done into (outputs, reasons), and return the row at which each begins.
+    def load(self, whole: list[np.ndarray]) -> set[int]:
+        """Read the chunks that are done into [reasons, *outputs], and return the row at which each begins.
 
         **Warns:** of damaged chunks.
         """
-        outputs, reasons = results
-        whole, done, damaged = [reasons, *jax.tree.leaves(outputs)], set(), 0
-        for start in range(0, len(reasons), self.size):
-            part = slice(start, min(start + self.size, len(reasons)))
+        done, damaged, count = set(), 0, len(whole[0])
+        for start in range(0, count, self.size):
+            part = slice(start, min(start + self.size, count))
             try:
                 pieces = self._read(start, part)
             except Exception:  # a damaged file can raise anything
@@ -122,10 +121,8 @@ class SweepStore(NamedTuple):
             raise ValueError("these are not the numbers that were written")
         return pieces
 
-    def save(self, start: int, part: slice, computed: tuple[Any, np.ndarray]) -> None:
-        """Write the outputs and reasons of a chunk, and then its checksum."""
-        outputs, reasons = computed
-        pieces = [reasons, *jax.tree.leaves(outputs)]
+    def save(self, start: int, part: slice, pieces: list[np.ndarray]) -> None:
+        """Write the reasons and outputs of a chunk, and then its checksum."""
         for array, piece in zip(self.arrays, pieces, strict=True):
             self._write(array, start, part, piece)
         self._write(self.done, start, start // self.size, self._checksum(start, pieces))
@@ -173,26 +170,25 @@ def _claim(path, identity, content):
         )
 
 
-def _known_files(identity, program, params, order, not_run) -> dict[str, bytes]:
+def _known_files(identity, plan, params, order, not_run) -> dict[str, bytes]:
     """{path in the store: content} of all that a store holds before any chunk is done."""
     import zarr
     from zarr.storage import MemoryStore
 
-    outputs, reason = program.outputs
-    count, chunks = len(order), -(-len(order) // program.size)
+    count, chunks = len(order), -(-len(order) // plan.size)
     kept = {}
     group = zarr.create_group(MemoryStore(kept), attributes=identity)
 
-    def add(name, dtype, fill_value, shape=(count,), size=program.size):
+    def add(name, dtype, fill_value, shape=(count,), size=plan.size):
         labels = identity if name in LABELLED else {}
         sizes = (size, *(max(1, length) for length in shape[1:]))
         return group.create_array(
             name, shape=shape, chunks=sizes, dtype=dtype, fill_value=fill_value, attributes=labels
         )
 
-    add("reason", reason.dtype, not_run)
-    for name, info in zip(_names("output", outputs), jax.tree.leaves(outputs), strict=True):
-        add(name, info.dtype, np.nan if np.issubdtype(info.dtype, np.inexact) else 0, (count, *info.shape[1:]))
+    add("reason", np.int8, not_run)
+    for name, info in zip(_names("output", plan.outputs), jax.tree.leaves(plan.outputs), strict=True):
+        add(name, info.dtype, np.nan if np.issubdtype(info.dtype, np.inexact) else 0, (count, *info.shape))
     add("done", np.uint64, 0, (chunks,), 1)
     inputs = dict(zip(_names("params", params), jax.tree.leaves(params), strict=True)) | {"member": order}
     for name, array in inputs.items():
