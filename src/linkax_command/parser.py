@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
-COMMANDS = ("list", "simulate", "compare")
+COMMANDS = ("list", "simulate", "compare", "sweep")
 PRESETS = ("draft", "balanced", "precise")
 SOLVERS = ("tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5", "rodas5p", "rk4")
 EQUAL = ("tolerance", "cost")
@@ -18,6 +18,10 @@ FORMULATIONS = (
     "A NAME is tangent-space (the paper's), or one of lagrange-multipliers, lagrange-multipliers-block, "
     "augmented-lagrangian, moore-penrose-svd, moore-penrose-gram-schmidt, udwadia-kalaba, projection-operator, with "
     "+baumgarte added, and +partitioning or +projection."
+)
+STUDY = (
+    "STUDY.py defines `function`, of one member's params, and `params`, arrays with one entry for each member, as "
+    "linkax.sweep takes them; and perhaps `options`, a dictionary with some of its chunk, memory and difficulty."
 )
 
 
@@ -65,6 +69,12 @@ def parsed(argv: Sequence[str] | None = None) -> argparse.Namespace:
     compare.add_argument(
         "--all-rows", action="store_true", help="with the loop rows too that no motion changes, which linkax leaves out"
     )
+    sweep = commands.add_parser(
+        "sweep",
+        help="evaluate the function of a Python file for all of its parameters, and keep the results",
+        epilog=STUDY,
+    )
+    _add_sweep_options(sweep)
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:  # of which argparse has no more to say
         parser.error(_unknown(argv[0], COMMANDS, "command "))
     return parser.parse_args(argv)
@@ -101,6 +111,17 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dt", type=_positive, metavar="S", help="fixed steps [s], instead of ones that adapt")
     parser.add_argument("--out", type=_path, metavar="DIR", help="folder for the files (default: under linkax-out)")
     parser.add_argument("--no-plots", action="store_true", help="write no pictures")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
+
+
+def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a sweep."""
+    parser.add_argument("study", metavar="STUDY.py", type=_path, help="a study file, see below")
+    scheduler = "of Dask, whose workers compute (default: the cores or devices of this machine)"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=scheduler)
+    parser.add_argument("--resume", action="store_true", help="go on with the sweep in the store, if there is one")
+    out = "Zarr store for the results (default: STUDY.zarr under linkax-out)"
+    parser.add_argument("--out", type=_path, metavar="DIR", help=out)
     parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
 
 
@@ -141,5 +162,5 @@ def _positive(text: str) -> float:
 
 def _path(text: str) -> Path:
     if not text:
-        raise argparse.ArgumentTypeError("'' is no folder; give its name")
+        raise argparse.ArgumentTypeError("'' names nothing; give a name")
     return Path(text)
