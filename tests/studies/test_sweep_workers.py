@@ -227,7 +227,7 @@ def test_a_worker_that_refuses_ends_the_sweep():
         lx.sweep(jnp.sin, NUMBERS, executor=Other())
 
 
-def test_executors_that_cannot_be():
+def test_executors_that_cannot_be(monkeypatch):
     class Client:
         def get_executor(self):
             raise AssertionError
@@ -238,6 +238,8 @@ def test_executors_that_cannot_be():
     fork = concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("fork"))
     refused(sweep(executor=fork), "executor", "fork", "spawn")
     refused(sweep(executor=Here(), devices=jax.devices()), "devices", "executor")
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    refused(sweep(executor=Here()), "executor", "jax.distributed job of 2 processes")
 
 
 def test_functions_that_cannot_be_sent(monkeypatch):

@@ -61,7 +61,7 @@ def _store(arguments) -> Path:
     """
     store = Path("linkax-out", f"{arguments.study.stem}.zarr") if arguments.out is None else arguments.out
     writable_folder(store, "give another by --out")
-    if not arguments.resume and any(store.iterdir()):
+    if not arguments.resume and any(not entry.name.startswith(".") for entry in store.iterdir()):
         raise ValueError(
             f"--out {str(store)!r} is not empty; go on with its sweep by --resume, or give another folder by --out"
         )

@@ -49,8 +49,10 @@ class Work(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """Why a worker cannot run what it got. It is returned, as engines try again what is raised, and wrap it in errors
-    of their own."""
+    """Why a worker cannot run what it got.
+
+    It is returned, since engines wrap what is raised in errors of their own, and may try it again.
+    """
 
     why: str
 
