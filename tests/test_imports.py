@@ -16,7 +16,7 @@ LAYERS += ["analysis", "studies", "scenes", "scenery", "view", "plot", "cli"]
 # Methods that hand on to a higher layer, which they import when they are called.
 HAND_ON = {
     ("linkax.model.mechanism", "linkax.simulation.read.solution"),
-    ("linkax.simulation.read.solution", "linkax.view"),
+    ("linkax.simulation.read.kinematics", "linkax.view"),
 }
 
 
