@@ -15,7 +15,7 @@ from linkax.model.elements import AbstractElement
 from linkax.model.joints.distance import Distance
 from linkax.model.mechanism import Mechanism
 from linkax.model.names import ByName
-from linkax.model.numbers import Number, number, require
+from linkax.model.numbers import Number, Vector, number, require
 from linkax.simulation.explain.error_estimate import refined_run
 from linkax.simulation.explain.remarks import remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
@@ -29,6 +29,7 @@ from linkax.simulation.read.by_name import (
     of_constraint,
     reaction_of,
 )
+from linkax.simulation.read.interpolation import motion_at
 from linkax.simulation.read.kinematics import Kinematics
 from linkax.simulation.read.observables import Observables, Power, Violation
 from linkax.simulation.read.passages import Passages, passages
@@ -295,6 +296,24 @@ class Solution(Kinematics):
         **Raises:** `ValueError` for a batch, or where functions of one's own were saved.
         """
         return passages(self)
+
+    def at(self, ts: Vector | list[Number]) -> "Solution":
+        """The same motion at other times between the saved ones, to be read as this one.
+
+        Between two saved times the motion is a polynomial of degree five through q, q̇ and q̈ at both. Coordinates are
+        off in proportion to the sixth power of the time between saved ones, speeds to the fifth; accelerations and
+        reactions follow from these by the equations of motion. A pendulum saved 16 times a period is off by 9e-8 of its
+        amplitude, and by 2e-6 of its speed; 33 times a period, by 1.4e-9 and 7e-8. Where a force jumps between saved
+        times, the error falls with the second power alone. Derivatives by `ts` are those of the polynomial.
+
+        **Arguments:** `ts`: times in any order, (n,) [s]; (*batch, n) for times of its own of each member of a batch.
+
+        **Returns:** a `Solution` at these times. Inside of JAX transformations, where times are not known, one outside
+        of the saved ones is infinite, as one that was not reached.
+
+        **Raises:** `ValueError` for a time outside of the saved ones, and for a solution of one state.
+        """
+        return motion_at(self, ts)
 
     def evaluate(self, t: Number) -> State:
         """The state at a time [s] between the steps; needs `saveat=SaveAt(dense=True)`."""
