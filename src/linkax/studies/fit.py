@@ -1,7 +1,7 @@
 """Fit parameters to measurements, by gradients, and estimate their uncertainty."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -11,13 +11,24 @@ import numpy as np
 import optimistix as optx
 
 from linkax.model.numbers import number, require, require_type, whole_number
-from linkax.studies.fit_result import Fit
-from linkax.studies.fit_search import AbstractSearch, Descent, Mode, Squares, run_search, sensitivity
+from linkax.studies.experiments import Experiment, Noise
+from linkax.studies.fit_result import Fit, Starts
+from linkax.studies.fit_search import (
+    AbstractSearch,
+    Descent,
+    Mode,
+    Squares,
+    run_search,
+    search_from_each,
+    sensitivity,
+)
 from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.laboratory import Laboratory
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.parameters import as_arrays
 from linkax.studies.uncertainty import DEPENDENT, uncertainty
 from linkax.xla.users_line import warn
+from linkax.xla.waiting import compiling
 
 if TYPE_CHECKING:
     from optax import GradientTransformation
@@ -26,6 +37,8 @@ else:
 
 DEFAULT_STEPS = {"residual": 100, "loss": 1000}
 DEFAULT_TOLERANCE = 1e-6
+SETTLED = 1e-2  # relative change of the noise of sensors, from which on it stays as it is found
+ROUNDS = 10  # of finding it
 DEFAULT_RATE = 0.02  # of Adam, in parameters that all start near one
 NO_MINIMUM = {
     "at an edge": "the loss would fall further where the function is not finite, as where no state can be assembled; "
@@ -36,7 +49,7 @@ NO_MINIMUM = {
 
 
 def fit(
-    function: Callable,
+    function: Callable | Experiment | Sequence[Experiment],
     params: Any,
     args: tuple | list = (),
     *,
@@ -47,6 +60,7 @@ def fit(
     mode: Mode | None = None,
     checkpoint: str | os.PathLike | None = None,
     progress: bool | None = None,
+    starts: Any = None,
 ) -> Fit:
     """Find the parameters that minimise a residual's sum of squares, or a loss.
 
@@ -54,9 +68,11 @@ def fit(
 
     - `function`: (params, *args) -> a residual, arrays in any pytree whose sum of squares is minimised; or a loss, one
       number. Divide a residual by the standard deviation of its noise to weigh each measurement by what it is worth.
-      Several experiments are several parts of a residual; unknown initial states are parameters.
+      Several experiments are several parts of a residual; unknown initial states are parameters. Or a
+      `linkax.Experiment`, or a list of them.
     - `params`: pytree of numbers and arrays, where the fit starts; `Positive`, `Bounded` and `PhysicalInertia` among
-      them keep numbers physical. Each number is fitted in units of its start.
+      them keep numbers physical, `Normal` and `LogNormal` say what is known beforehand. Each number is fitted in units
+      of its start.
     - `args`: further arguments of the function, usually the measurements; others of the same shapes reuse the compiled
       program.
     - `optimiser`: for a residual, a least-squares solver of optimistix, by default Levenberg and Marquardt's method
@@ -70,6 +86,8 @@ def fit(
       one by the number of parameters.
     - `checkpoint`: a file, written at each step, from which the same fit goes on after it was killed or out of steps.
     - `progress`: whether to show a progress bar; by default where the output is a terminal.
+    - `starts`: what `params` are, with plain numbers and one axis before theirs: the fit searches from each, computed
+      as one batch, and goes on from the best. `Fit.starts` tells where the others led; one that fails harms no other.
 
     **Returns:** a `Fit`.
 
@@ -78,21 +96,68 @@ def fit(
 
     **Warns:** of parameters that the data do not determine, and where the fit ended at an edge or without derivative.
     """
-    require_type(function, Callable, "function", "give a residual or a loss, a function of (params, *args)")
+    kinds = Callable | Experiment | list | tuple
+    require_type(
+        function, kinds, "function", "give a residual or a loss, a function of (params, *args), or experiments"
+    )
     free = FreeParameters.of(params)
     require_type(args, list | tuple, "args", "give a tuple of what else the function gets")
     data = as_arrays(tuple(args), "args")
     _check_ending(steps, tolerance, patience)
+    laboratory = None
+    if not callable(function):
+        laboratory, function, data = _laboratory(function, free, args, checkpoint)
     is_loss = _is_loss(function, free, data)
     search = _search_by(optimiser, function, free, mode, is_loss, tolerance)
     steps = DEFAULT_STEPS["loss" if is_loss else "residual"] if steps is None else steps
-    z, losses, ended = run_search(search, data, steps, tolerance, patience, checkpoint, progress)
+    z, others = None, None
+    if starts is not None:
+        z, others = _best_start(search, free.starts(starts), data, steps, progress)
+    z, losses, ended = run_search(search, data, steps, tolerance, patience, checkpoint, progress, z)
+    if laboratory is not None and laboratory.finds_noise:
+        for _ in range(ROUNDS):
+            (before,), data = data, (laboratory.noise(laboratory.errors(free.params(z)), len(z)),)
+            if _is_settled(before, data[0]):
+                break
+            z, more, ended = run_search(search, data, steps, tolerance, patience, None, progress, z)
+            losses += more
     if is_loss:
         result = _without_covariance(search, z, min(losses), None, losses, ended)
     else:
-        result = _fit_of_residual(search, z, data, losses, ended, tolerance)
+        result = _fit_of_residual(search, z, data, losses, ended, tolerance, laboratory)
     _warn(result)
-    return result
+    return result._replace(starts=others)
+
+
+def _laboratory(experiments, free, args, checkpoint) -> tuple[Laboratory, Callable, tuple]:
+    """Experiments, their residual, and its argument: the noise that is found where the fit starts."""
+    if len(args):
+        raise ValueError(f"args are {args!r}; give them to the experiments, linkax.Experiment(..., args=)")
+    start = free.params(free.start)
+    laboratory = Laboratory.of(experiments, start)
+    if laboratory.finds_noise and checkpoint is not None:
+        raise ValueError(
+            f"checkpoint is {checkpoint!r}; a fit that finds the noise keeps none: give all sensors a noise"
+        )
+    with compiling():
+        errors = laboratory.errors(start)
+    return laboratory, laboratory.together, (laboratory.noise(errors),)
+
+
+def _is_settled(before: Noise, now: Noise) -> bool:
+    return all(np.all(np.abs(now[name] / before[name] - 1.0) <= SETTLED) for name in now)
+
+
+def _best_start(search, starts, data, steps, progress):
+    """The best of several searches, and where all led.
+
+    **Raises:** `ValueError` where none can begin.
+    """
+    every, losses, ended = search_from_each(search, starts, data, steps, progress)
+    if not np.any(np.isfinite(losses)):
+        raise ValueError(f"the function is finite at none of {len(losses)} starts; give others")
+    params = jax.tree.map(np.asarray, jax.vmap(search.free.params)(jnp.asarray(every)))
+    return jnp.asarray(every[np.argmin(losses)]), Starts(params, losses, ended)
 
 
 def _is_loss(function, free, args) -> bool:
@@ -122,15 +187,25 @@ def _search_by(optimiser, function, free, mode, is_loss, tolerance) -> AbstractS
     return (Squares if by_squares else Descent)(optimiser, function, free, mode, is_loss)
 
 
-def _fit_of_residual(search, z, args, losses, ended, tolerance) -> Fit:
+def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> Fit:
     """The `Fit` of a residual, with covariance where the search may have ended in a minimum."""
     residual, slopes = (np.asarray(part) for part in sensitivity(search, z, args))
     if ended == "converged" and _is_at_edge(search, z, args, residual, slopes, tolerance):
         ended = "at an edge"
-    result = _without_covariance(search, z, float(0.5 * residual @ residual), residual, losses, ended)
+    loss, count, scatter = float(0.5 * residual @ residual), len(residual) - search.free.num_priors, None
+    there, factors = np.ones(len(residual), bool), np.ones(len(residual))
+    if laboratory is not None:
+        errors = laboratory.errors(search.free.params(z))
+        worth = laboratory.worth(errors, args[0], len(z))
+        there[:count], factors[:count], scatter = errors.there, worth.factors, worth.scatter
+    count = int(np.sum(there[:count]))
+    residual, slopes = residual[there], (factors[:, None] * slopes)[there]
+    result = _without_covariance(search, z, loss, residual[:count], losses, ended)
+    if laboratory is not None:
+        result = result._replace(experiments=tuple(laboratory.experiments), noises=dict(args[0]))
     if ended in NO_MINIMUM:
         return result
-    estimate = uncertainty(residual, slopes, search.free, z)
+    estimate = uncertainty(residual, slopes, search.free, z, scatter)
     return result._replace(
         covariance=estimate.covariance,
         noise=estimate.noise,

@@ -1,6 +1,6 @@
 """The result of a fit, and how sure its parameters are."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from linkax.studies.experiments import Experiment, Experiments, predict
 from linkax.tables import Rows, Table, count, known, numbers, printed_as
 
 
@@ -27,23 +28,40 @@ def _undetermined(fit, name):
     return ["not determined by the data" if name in fit.undetermined else ""]
 
 
+class Starts(NamedTuple):
+    """Where the searches from several starts led.
+
+    - `params`: with one axis more, of the n starts. `losses`: (n,), infinite where a search could not begin.
+    - `ended`: how each ended, see `Fit`.
+    """
+
+    params: Any
+    losses: np.ndarray
+    ended: list[str]
+
+
 @printed_as(_table)
 class Fit(NamedTuple):
     """The parameters of a fit, their covariance, and how the fit ended.
 
     - `params`: fitted numbers, in the structure of the initial `params`, with plain numbers in place of `Positive`,
-      `Bounded` and `PhysicalInertia`.
-    - `loss`: the loss, or half the sum of squares of the residual. `residual`: at `params`, (n,); None for a loss.
+      `Normal` and their like.
+    - `loss`: the loss, or half the sum of squares of the residual, with those of priors. `residual`: at `params`, (n,),
+      without priors and missing samples; None for a loss.
     - `names`: of the p numbers in `params`, in the order of `covariance`.
     - `covariance`: of these numbers, (p, p), estimated from the sensitivities of the residual and its size. Infinite
       for numbers that the data do not determine; None for a loss, and where the fit ended at an edge or without
-      derivative. `noise`: standard deviation of the residual, None likewise.
+      derivative. `noise`: standard deviation of the residual, None likewise; of experiments in units of the noise that
+      sensors give, or that was found.
     - `undetermined`: names of the numbers that the data do not determine.
-    - `history`: {"loss": at each step}. `steps`: number of steps.
+    - `history`: {"loss": at each step, where noise is found in units of that found so far}. `steps`: number of steps.
     - `ended`: "converged", "stopped early", "diverged", or "out of steps"; "at an edge", where the loss would fall
       further but the function is not finite there; "no derivative", where the function is finite and its derivative is
       not.
     - `spread`: level of confidence -> ends of the intervals; None where `covariance` is.
+    - `experiments`: those that were fitted, none for a function. `noises`: {channel: standard deviation} of what their
+      sensors tell, where these do not give it.
+    - `starts`: `Starts`, where there were several.
     """
 
     params: Any
@@ -57,6 +75,9 @@ class Fit(NamedTuple):
     steps: int
     ended: str
     spread: Callable[[float], tuple[Any, Any]] | None
+    experiments: tuple[Experiment, ...] = ()
+    noises: dict[str, np.ndarray] | None = None
+    starts: Starts | None = None
 
     @property
     def standard_errors(self) -> Any:
@@ -81,6 +102,15 @@ class Fit(NamedTuple):
         if not 0.0 < level < 1.0:
             raise ValueError(f"level is {level!r}; it must lie between 0 and 1, such as 0.95")
         return self.spread(level)
+
+    def predict(self, experiments: Experiment | Sequence[Experiment] | None = None) -> list[dict[str, np.ndarray]]:
+        """What sensors would tell without noise, {channel: (n,) or (n, k)} of each experiment.
+
+        **Arguments:** `experiments`: by default those that were fitted; give others to see how well they are predicted.
+        """
+        experiments = self.experiments if experiments is None else experiments
+        given = [experiments] if isinstance(experiments, Experiment) else list(experiments)
+        return jax.tree.map(np.asarray, predict(Experiments.of(given), self.params))
 
     def _no_covariance(self):
         return ValueError(

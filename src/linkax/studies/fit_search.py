@@ -51,8 +51,12 @@ class AbstractSearch(eqx.Module):
     is_loss: bool = eqx.field(static=True)
 
     def flat(self, z: Float[Array, " p"], args: tuple) -> Float[Array, " n"]:
-        """The residual, or the loss, as a vector."""
-        return ravel_pytree(self.function(self.free.params(z), *args))[0]
+        """The residual and that of priors, or the loss with theirs, as a vector."""
+        found = ravel_pytree(self.function(self.free.params(z), *args))[0]
+        if not self.free.num_priors:
+            return found
+        prior = self.free.prior(z)
+        return found + 0.5 * jnp.sum(prior**2) if self.is_loss else jnp.concatenate([found, prior])
 
     @abc.abstractmethod
     def evaluated(self, z: Float[Array, " p"], state: Any, args: tuple) -> Evaluation:
@@ -146,15 +150,16 @@ def run_search(
     patience: int | None,
     checkpoint: str | os.PathLike | None,
     progress: bool | None,
+    start: Float[Array, " p"] | None = None,
 ) -> tuple[Float[Array, " p"], list[float], str]:
-    """Search from the start of the parameters; see `linkax.fit` for the arguments.
+    """Search from z = `start`, by default that of the parameters; see `linkax.fit` for the other arguments.
 
     **Returns:** the z of smallest loss, the loss at each step, and how the search ended, as in `linkax.Fit`.
 
     **Raises:** `ValueError` where the function is not finite or has no derivative at the start, and for a checkpoint
     of another fit.
     """
-    z = search.free.start
+    z = search.free.start if start is None else start
     with compiling():
         found = search.evaluated(z, None, args)
         state = _begin(search, z, found)
@@ -182,6 +187,59 @@ def run_search(
                 kept.save((z, best_z, state), losses, waited)
             ended = _ending(loss, smooth, done, patience is not None and waited >= patience)
     return best_z, losses, ended or "out of steps"
+
+
+@eqx.filter_jit
+def _evaluated_each(search, z, state, args):
+    over = eqx.if_array(0)
+    return eqx.filter_vmap(lambda z, state: search.evaluated(z, state, args), in_axes=(0, over))(z, state)
+
+
+@eqx.filter_jit
+def _begin_each(search, z, found):
+    return eqx.filter_vmap(search.begin)(z, found)
+
+
+@eqx.filter_jit
+def _step_each(search, z, state, args, found, active):
+    over = eqx.if_array(0)
+    step = lambda z, state, found: search.step(z, state, args, found)
+    moved, later, *told = eqx.filter_vmap(step, in_axes=(0, over, over))(z, state, found)
+
+    def kept(new, old):
+        return jnp.where(active.reshape(-1, *(1,) * (new.ndim - 1)), new, old) if eqx.is_array(new) else new
+
+    return kept(moved, z), jax.tree.map(kept, later, state), *told
+
+
+def search_from_each(
+    search: AbstractSearch, starts: Float[Array, "n p"], args: tuple, steps: int, progress: bool | None
+) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, " n"], list[str]]:
+    """Search from several starts, computed together; one that fails harms no other.
+
+    **Returns:** of each, the z of smallest loss, that loss, infinite where it could not begin, and how it ended.
+    """
+    z, ended = starts, [""] * len(starts)
+    best_z, best = np.array(starts), np.full(len(starts), np.inf)
+    with compiling():
+        found = _evaluated_each(search, z, None, args)
+        state = _begin_each(search, z, found)
+    with Progress(steps, "step", progress) as line:
+        for count in range(steps + 1):
+            active = np.array([not reason for reason in ended])
+            if not np.any(active):
+                break
+            found = _evaluated_each(search, z, state, args) if found is None else found
+            before = z
+            with compiling(count == 0):
+                z, state, loss, smooth, done = _step_each(search, z, state, args, found, jnp.asarray(active))
+            here, loss, found = np.asarray(z if isinstance(search, Squares) else before), np.asarray(loss), None
+            better = active & (loss <= best)
+            best[better], best_z[better] = loss[better], here[better]
+            for i in np.flatnonzero(active):
+                ended[i] = _ending(loss[i], smooth[i], done[i], False) or ""
+            line.tell("searching", count, f", {np.sum(~active)} of {len(active)} done, best loss {np.min(best):.6g}")
+    return best_z, best, [reason or "out of steps" for reason in ended]
 
 
 def _ending(loss, smooth, done, impatient) -> str | None:

@@ -61,10 +61,51 @@ class FreeParameters(eqx.Module):
         """z where the fit starts."""
         return ravel_pytree(self._starts())[0]
 
+    def starts(self, values: Any) -> Float[Array, "n p"]:
+        """z at several values of the parameters, which have an axis of that number before theirs.
+
+        **Raises:** `ValueError` for values of another structure or shape.
+        """
+        shapes = [jax.tree.map(jnp.shape, getattr(leaf, "value", leaf)) for leaf in self.leaves]
+        try:
+            parts = [jax.tree.map(jnp.asarray, part) for part in self.structure.flatten_up_to(values)]
+            counts = {jnp.shape(part)[0] for part in jax.tree.leaves(parts)}
+            fits = len(counts) == 1 and [jax.tree.map(lambda x: x.shape[1:], part) for part in parts] == shapes
+        except (IndexError, TypeError, ValueError):
+            fits = False
+        if not fits:
+            raise ValueError(
+                f"starts are {values!r}; give what params are, plain numbers in place of linkax.Positive and its like, "
+                "each with the same first axis, one entry for each start"
+            )
+
+        def z_of(*parts):
+            free = [
+                eqx.tree_at(lambda leaf: leaf.value, leaf, part).free if isinstance(leaf, AbstractParameter) else part
+                for leaf, part in zip(self.leaves, parts, strict=True)
+            ]
+            return ravel_pytree([part / scale for part, scale in zip(free, self.scales, strict=True)])[0]
+
+        return jax.vmap(z_of)(*parts)
+
+    def _parts(self, z) -> list[Any]:
+        """z in the structure of the free numbers of the leaves."""
+        restored: Any = ravel_pytree(self._starts())[1]
+        return restored(z)
+
+    def prior(self, z: Float[Array, " p"]) -> Float[Array, " k"]:
+        """The residual of priors: what is normal beforehand, with standard deviation 1."""
+        parts = [part for part, leaf in zip(self._parts(z), self.leaves, strict=True) if has_prior(leaf)]
+        return ravel_pytree(parts)[0]
+
+    @property
+    def num_priors(self) -> int:
+        """Number of entries of `prior`."""
+        return sum(scale.size for scale, leaf in zip(self.scales, self.leaves, strict=True) if has_prior(leaf))
+
     def params(self, z: Float[Array, " p"]) -> Any:
         """The argument of the user's function, at z."""
-        restored: Any = ravel_pytree(self._starts())[1]
-        free = [part * scale for part, scale in zip(restored(z), self.scales, strict=True)]
+        free = [part * scale for part, scale in zip(self._parts(z), self.scales, strict=True)]
         values = [
             leaf.value_of(x) if isinstance(leaf, AbstractParameter) else x
             for leaf, x in zip(self.leaves, free, strict=True)
@@ -93,6 +134,11 @@ class FreeParameters(eqx.Module):
             for leaf, scale in zip(self.leaves, self.scales, strict=True)
         ]
         return np.concatenate([np.full(numbers, numbers == free) for numbers, free in sizes])
+
+
+def has_prior(leaf: Any) -> bool:
+    """Whether the free numbers of a leaf have a prior."""
+    return isinstance(leaf, AbstractParameter) and leaf.has_prior
 
 
 def _is_parameter(node) -> bool:

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,6 +17,9 @@ from linkax.xla.arrays import Array
 
 class AbstractParameter(eqx.Module):
     """A parameter as a function of free numbers, which may take any value. `value`: where the fit starts."""
+
+    # Whether the free numbers are known beforehand to be normal, with mean 0 and standard deviation 1.
+    has_prior: ClassVar[bool] = False
 
     value: eqx.AbstractVar[Any]
 
@@ -74,6 +77,76 @@ class Bounded(AbstractParameter):
 
     def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.asarray(self.lower + (self.upper - self.lower) * jax.nn.sigmoid(free))
+
+
+class Normal(AbstractParameter):
+    """Numbers of which a mean and a standard deviation are known beforehand: a prior, or a regularisation.
+
+    The fit adds half the square of (value − mean) / deviation to the loss, so a residual beside it must be in units of
+    its noise, as that of `linkax.Experiment` is.
+
+    **Arguments:** `mean`, `deviation`: of any shape that fit to each other. `value`: where the fit starts, by default
+    the mean.
+
+    **Raises:** `ValueError` for a deviation that is not positive, and numbers that are not finite.
+    """
+
+    has_prior = True
+
+    value: Float[Array, "..."]
+    mean: Float[Array, "..."]
+    deviation: Float[Array, "..."]
+
+    def __init__(
+        self, mean: ArrayLike | Sequence, deviation: ArrayLike | Sequence, value: ArrayLike | Sequence | None = None
+    ) -> None:
+        given = jnp.asarray(real(mean, "Normal: mean")), jnp.asarray(real(deviation, "Normal: deviation"))
+        mean, self.deviation = jnp.broadcast_arrays(*given)
+        self.mean = require(mean, is_finite, "Normal: mean", "it must be finite")
+        self.deviation = require(
+            self.deviation, lambda d: is_finite(d) & (d > 0.0).all(), "Normal: deviation", "it must be positive"
+        )
+        start = mean if value is None else jnp.broadcast_to(jnp.asarray(real(value, "Normal: value")), mean.shape)
+        self.value = require(start, is_finite, "Normal: value", "it must be finite")
+
+    @property
+    def free(self) -> Float[Array, "..."]:
+        return (self.value - self.mean) / self.deviation
+
+    def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.mean + self.deviation * free
+
+
+class LogNormal(AbstractParameter):
+    """Positive numbers known beforehand but for a factor: the logarithm has a `Normal` prior.
+
+    **Arguments:** `median`: of any shape. `factor`: larger than 1; the number is within median / factor and
+    median × factor with a probability of 68 %. `value`: where the fit starts, by default the median.
+
+    **Raises:** `ValueError` for numbers that are not positive, and a factor that is not larger than 1.
+    """
+
+    has_prior = True
+
+    value: Float[Array, "..."]
+    median: Float[Array, "..."]
+    factor: Float[Array, ""]
+
+    def __init__(
+        self, median: ArrayLike | Sequence, factor: ArrayLike, value: ArrayLike | Sequence | None = None
+    ) -> None:
+        positive = lambda entry: _checked("LogNormal", entry, lambda x: x > 0.0, "must be positive")
+        self.median = positive(median)
+        larger = "it must be larger than 1"
+        self.factor = jnp.asarray(require(number(factor, (), "LogNormal: factor"), lambda x: x > 1.0, "factor", larger))
+        self.value = self.median if value is None else jnp.broadcast_to(positive(value), self.median.shape)
+
+    @property
+    def free(self) -> Float[Array, "..."]:
+        return jnp.log(self.value / self.median) / jnp.log(self.factor)
+
+    def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.median * self.factor**free
 
 
 class Inertia(NamedTuple):

@@ -32,11 +32,30 @@ class Uncertainty(NamedTuple):
     spread: Callable[[float], tuple[Any, Any]]
 
 
+class Scatter(NamedTuple):
+    """How much measurements scatter.
+
+    - `noise`: standard deviation of the residual. `variances`: of its rows, (n,).
+    """
+
+    noise: float
+    variances: Float[np.ndarray, " n"]
+
+
 def uncertainty(
-    residual: Float[np.ndarray, " n"], slopes: Float[np.ndarray, "n p"], free: FreeParameters, z: Float[Array, " p"]
+    residual: Float[np.ndarray, " n"],
+    slopes: Float[np.ndarray, "n p"],
+    free: FreeParameters,
+    z: Float[Array, " p"],
+    scatter: Scatter | None = None,
 ) -> Uncertainty:
-    """Estimate the covariance of the parameters at z, by column-pivoted QR of the residual's sensitivities `slopes`."""
-    count, size = slopes.shape
+    """Estimate the covariance of the parameters at z, by column-pivoted QR of the residual's sensitivities `slopes`.
+
+    The last rows are those of priors, which have variance one.
+
+    **Arguments:** `scatter`: of the other rows; by default all have one noise, which is estimated.
+    """
+    count, size = len(slopes) - free.num_priors, slopes.shape[1]
     norms = np.linalg.norm(slopes, axis=0)
     matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
     scale = np.where(matters, norms, 1.0)
@@ -48,15 +67,21 @@ def uncertainty(
     inverse = np.linalg.inv(r[:rank, :rank]) if rank else np.zeros((0, 0))
     rows = order[:rank]
     to_free[np.ix_(rows, rows)] = inverse @ inverse.T / np.outer(scale[rows], scale[rows])
-    freedom = max(count - rank, 1)
-    noise = float(np.sqrt(residual @ residual / freedom))
+    gain = to_free @ slopes.T
+    # What is left of the measurements when they have determined what priors leave to them.
+    freedom = max(count - float(np.sum(gain.T[:count] * slopes[:count])), 1.0)
+    if scatter is None:
+        noise = float(np.sqrt(residual[:count] @ residual[:count] / freedom))
+        scatter = Scatter(noise, np.full(count, noise**2))
+    variances = np.concatenate([scatter.variances, np.ones(len(slopes) - count)])
+    of_free = gain * variances @ gain.T
     # Changes that the residual does not see: of one dependent parameter, and of those that make up for it.
     unseen = np.zeros((size, size - rank))
     unseen[order[:rank]] = -inverse @ r[:rank, rank:]
     unseen[order[rank:]] = np.eye(size - rank)
     lost = np.any(np.abs(unseen) > INVOLVED, axis=1)
     slopes_of_params = np.asarray(jax.jacfwd(free.vector)(z))
-    covariance = noise**2 * slopes_of_params @ to_free @ slopes_of_params.T
+    covariance = slopes_of_params @ of_free @ slopes_of_params.T
     depends = np.abs(slopes_of_params)
     depends = np.where(depends > NO_INFLUENCE * np.max(depends, axis=1, keepdims=True), slopes_of_params, 0.0)
     # A number is undetermined where the free numbers that it depends on are, and their changes do not cancel.
@@ -64,9 +89,9 @@ def uncertainty(
     together = np.abs(depends @ (unseen / scale[:, None]))
     undetermined = np.any((each > 0.0) & (together > INVOLVED * each), axis=1)
     covariance[undetermined, undetermined] = np.inf
-    deviation = noise * np.sqrt(np.where(lost, np.inf, np.diagonal(to_free)))
+    deviation = np.sqrt(np.where(lost, np.inf, np.diagonal(of_free)))
     names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
-    return Uncertainty(covariance, noise, names, partial(_ends, free, z, covariance, deviation, freedom))
+    return Uncertainty(covariance, scatter.noise, names, partial(_ends, free, z, covariance, deviation, freedom))
 
 
 def _ends(free, z, covariance, deviation, freedom, level):

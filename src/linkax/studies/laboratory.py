@@ -1,0 +1,195 @@
+"""Noise in experiments: how large it is, and how sure it leaves what is fitted."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from linkax.model.numbers import require_type
+from linkax.studies.experiments import Experiment, Experiments, Noise, predict
+from linkax.studies.losses import Loss, influence, spread
+from linkax.studies.sensors import AbstractSensor
+from linkax.studies.uncertainty import Scatter
+
+LEAST = 1e-9  # noise relative to the largest measurement, below which it is rounding
+
+
+class Errors(NamedTuple):
+    """Predicted less measured numbers, in the order of the rows of a residual.
+
+    - `values`: NaN where a sample is missing, (n,). `groups`: index of each in `names`.
+    - `names`: (channel, component), of all experiments together.
+    """
+
+    values: Float[np.ndarray, " n"]
+    groups: Int[np.ndarray, " n"]
+    names: list[tuple[str, int]]
+
+    @property
+    def there(self) -> np.ndarray:
+        """Which samples are not missing, (n,)."""
+        return ~np.isnan(self.values)
+
+    def of(self, group: int) -> np.ndarray:
+        """Which are of a group, and not missing, (n,)."""
+        return self.there & (self.groups == group)
+
+
+class Worth(NamedTuple):
+    """What rows of a residual are worth.
+
+    - `factors`: of their sensitivities, for whose squares to be the curvature of the loss, (n,); with missing samples.
+    - `scatter`: of the rows, without missing samples.
+    """
+
+    factors: Float[np.ndarray, " n"]
+    scatter: Scatter
+
+
+class Laboratory(NamedTuple):
+    """Experiments, and what is known of their noise, outside of programs.
+
+    - `experiments`: the list. `together`: as one residual. `sensors`: of each, by channel, at some parameters.
+    """
+
+    experiments: list[Experiment]
+    together: Experiments
+    sensors: list[dict[str, AbstractSensor]]
+
+    @staticmethod
+    def of(experiments: Experiment | Sequence[Experiment], params: Any) -> "Laboratory":
+        """Read one experiment or a list of them, at parameters.
+
+        **Raises:** `ValueError` for entries that are no experiments, and where sensors of one channel contradict.
+        """
+        found = [experiments] if isinstance(experiments, Experiment) else list(experiments)
+        for each in found:
+            require_type(
+                each, Experiment, "an entry of a list to fit", "give linkax.Experiment(model, record, sensors)"
+            )
+        if not found:
+            raise ValueError(
+                "there are no experiments in the list to fit; give linkax.Experiment(model, record, sensors)"
+            )
+        return Laboratory(found, Experiments.of(found), [each.sensors_at(params) for each in found])
+
+    @property
+    def by_channel(self) -> dict[str, AbstractSensor]:
+        """The first sensor of each channel.
+
+        **Raises:** `ValueError` where another one has another loss, or noise that is known.
+        """
+        first: dict[str, AbstractSensor] = {}
+        for name, sensor in ((name, sensor) for sensors in self.sensors for name, sensor in sensors.items()):
+            other = first.setdefault(name, sensor)
+            if (sensor.loss, sensor.noise is None) != (other.loss, other.noise is None):
+                raise ValueError(
+                    f"sensors of channel {name!r} differ in their loss, or in whether their noise is known; give the "
+                    "channels different names"
+                )
+        return first
+
+    @property
+    def finds_noise(self) -> bool:
+        """Whether a sensor does not give its noise."""
+        return any(sensor.noise is None for sensor in self.by_channel.values())
+
+    def _rows(self, of_channel) -> np.ndarray:
+        """Numbers of all channels, in the order of the rows; of_channel: (experiment's index, name) -> array."""
+        return np.concatenate(
+            [np.ravel(of_channel(i, name)) for i, each in enumerate(self.sensors) for name in sorted(each)]
+        )
+
+    def errors(self, params: Any) -> Errors:
+        """What predictions are off.
+
+        **Raises:** `ValueError` where they are not finite, with the reason.
+        """
+        predicted = predict(self.together, params)
+        measured = lambda i, name: np.asarray(self.experiments[i].record[name].values)
+        values = self._rows(lambda i, name: np.asarray(predicted[i][name]) - measured(i, name))
+        missing = np.isnan(self._rows(measured))
+        if not np.all(np.isfinite(values) | missing):
+            raise ValueError(self._reason(predicted, params))
+        sizes = {
+            name: max(np.shape(measured(i, name))[1:], default=1)
+            for i, each in enumerate(self.sensors)
+            for name in each
+        }
+        names = [(name, component) for name, size in sizes.items() for component in range(size)]
+        index = lambda i, name: np.broadcast_to(
+            np.reshape([names.index((name, part)) for part in range(sizes[name])], measured(i, name).shape[1:]),
+            measured(i, name).shape,
+        )
+        return Errors(np.where(missing, np.nan, values), self._rows(index), names)
+
+    def _reason(self, predicted, params) -> str:
+        """Why a prediction is not finite, found without programs."""
+        is_bad = lambda i, name: not np.all(np.isfinite(np.asarray(predicted[i][name])))
+        place, name = next((i, name) for i, each in enumerate(self.sensors) for name in each if is_bad(i, name))
+        experiment = self.experiments[place]
+        which = f"channel {name!r}" + (f" of experiment {place}" if len(self.experiments) > 1 else "")
+        try:
+            solution = experiment.model(params, *experiment.args)
+            self.sensors[place][name].predict(solution, experiment.record[name].ts)
+        except Exception as error:
+            return f"{which} cannot be predicted where the fit starts: {error}"
+        return f"{which} is not predicted to be finite where the fit starts; look at the solution of its model"
+
+    def noise(self, errors: Errors, size: int = 0) -> Noise:
+        """Estimate the noise of sensors that give none, by channel, where `size` numbers have been fitted to it."""
+        found, largest = {}, self._rows(lambda i, name: np.abs(self.experiments[i].record[name].values))
+        for name, sensor in self.by_channel.items():
+            if sensor.noise is not None:
+                continue
+            groups = [group for group, (channel, _) in enumerate(errors.names) if channel == name]
+            each = [
+                max(
+                    _share(errors, size) * spread(sensor.loss, errors.values[errors.of(group)]),
+                    LEAST * np.max(largest[errors.of(group)]),
+                    np.finfo(float).tiny,
+                )
+                for group in groups
+            ]
+            shape = next(
+                np.shape(each.record[name].values)[1:] for each in self.experiments if name in each.record.channels
+            )
+            found[name] = np.reshape(each, shape)
+        return found
+
+    def worth(self, errors: Errors, noise: Noise, size: int) -> Worth:
+        """What the rows of the residual are worth.
+
+        The estimate is an M-estimate: with ψ the derivative of the loss by u, the residual in units of the noise, and j
+        that of u by the parameters, its covariance is A⁻¹ B A⁻¹ with A = Σ E[ψ′] jᵀj and B = Σ E[ψ²] jᵀj (Huber, Robust
+        Statistics, 1981, chapter 7). Expectations are means over each component of a channel; over all channels for
+        squares, whose noise may be known but for a factor.
+        """
+        deviations = self._rows(
+            lambda i, name: np.broadcast_to(
+                noise[name] if self.sensors[i][name].noise is None else self.sensors[i][name].noise,
+                np.shape(self.experiments[i].record[name].values),
+            )
+        )
+        u, share = errors.values / deviations, _share(errors, size)
+        losses: list[Loss] = [self.by_channel[name].loss for name, _ in errors.names]
+        squares = errors.there & np.isin(
+            errors.groups, [group for group, loss in enumerate(losses) if loss == "squares"]
+        )
+        factor = share * (spread("squares", u[squares]) if np.any(squares) else spread("huber", u[errors.there]))
+        factors, variances = np.ones_like(u), np.full_like(u, factor**2)
+        for group, loss in enumerate(losses):
+            rows = errors.of(group)
+            if loss != "squares":
+                of_square, first, second = influence(loss, u[rows])
+                factors[rows] = np.sqrt(np.mean(second)) / of_square
+                variances[rows] = share**2 * np.mean(first**2) / np.mean(second)
+        there = errors.there
+        return Worth(factors, Scatter(factor, variances[there]))
+
+
+def _share(errors, size) -> float:
+    """By how much noise is larger than what a fit of `size` numbers leaves of it."""
+    count = int(np.sum(errors.there))
+    return float(np.sqrt(count / max(count - size, 1)))
