@@ -17,6 +17,7 @@ LAYERS += ["analysis", "studies", "scenes", "scenery", "view", "plot", "cli"]
 HAND_ON = {
     ("linkax.model.mechanism", "linkax.simulation.read.solution"),
     ("linkax.simulation.read.kinematics", "linkax.view"),
+    ("linkax.studies.fit_result", "linkax.plot.fit_report"),
 }
 
 

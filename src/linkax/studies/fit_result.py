@@ -1,6 +1,8 @@
 """The result of a fit, and how sure its parameters are."""
 
+import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -8,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from linkax.model.numbers import require_type
 from linkax.studies.experiments import Experiment, Experiments, predict
 from linkax.tables import Rows, Table, count, known, numbers, printed_as
 
@@ -111,6 +114,23 @@ class Fit(NamedTuple):
         experiments = self.experiments if experiments is None else experiments
         given = [experiments] if isinstance(experiments, Experiment) else list(experiments)
         return jax.tree.map(np.asarray, predict(Experiments.of(given), self.params))
+
+    def report(self, path: str | os.PathLike, held_out: Experiment | Sequence[Experiment] = ()) -> Path:
+        """Write a report as one HTML file, which needs no network.
+
+        It has the parameters with their intervals, what is not determined, covariance and correlation; of each channel
+        measured and predicted values, residuals, and whether these are white (Ljung and Box); the same of records held
+        out. Of a fit of a function it has the residual as a whole.
+
+        **Arguments:** `path`: of the file. `held_out`: experiments that were not fitted.
+
+        **Raises:** `ValueError` for a folder that cannot be written to, and records without samples at which the motion
+        is known.
+        """
+        from linkax.plot.fit_report import report
+
+        path = Path(require_type(path, str | os.PathLike, "path", "give the name of a file"))
+        return report(self, path, [held_out] if isinstance(held_out, Experiment) else list(held_out))
 
     def _no_covariance(self):
         return ValueError(
