@@ -126,6 +126,8 @@ from linkax.studies.parameters import LogNormal as LogNormal  # noqa: E402
 from linkax.studies.parameters import Normal as Normal  # noqa: E402
 from linkax.studies.parameters import PhysicalInertia as PhysicalInertia  # noqa: E402
 from linkax.studies.parameters import Positive as Positive  # noqa: E402
+from linkax.studies.profile import profile as profile  # noqa: E402
+from linkax.studies.profile_result import Profile as Profile  # noqa: E402
 from linkax.studies.records import Channel as Channel  # noqa: E402
 from linkax.studies.records import Record as Record  # noqa: E402
 from linkax.studies.records import read_record as read_record  # noqa: E402

@@ -1,7 +1,7 @@
 """The result of a fit, and how sure its parameters are."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from linkax.model.numbers import require_type
+from linkax.model.numbers import require_type, whole_number
 from linkax.studies.experiments import Experiment, Experiments, predict
+from linkax.studies.uncertainty import Spread
 from linkax.tables import Rows, Table, count, known, numbers, printed_as
+from linkax.xla.arrays import Array
 
 
 def _table(fit: "Fit") -> Table:
@@ -77,7 +79,7 @@ class Fit(NamedTuple):
     history: dict[str, np.ndarray]
     steps: int
     ended: str
-    spread: Callable[[float], tuple[Any, Any]] | None
+    spread: Spread | None
     experiments: tuple[Experiment, ...] = ()
     noises: dict[str, np.ndarray] | None = None
     starts: Starts | None = None
@@ -100,11 +102,39 @@ class Fit(NamedTuple):
 
         **Raises:** `ValueError` for a fit without covariance, and for a level that is not between 0 and 1.
         """
-        if self.spread is None:
-            raise self._no_covariance()
+        spread = self.determined()
         if not 0.0 < level < 1.0:
             raise ValueError(f"level is {level!r}; it must lie between 0 and 1, such as 0.95")
-        return self.spread(level)
+        return spread(level)
+
+    def sample(self, key: Array, count: int) -> Any:
+        """Draw parameters from Laplace's approximation of their posterior, for predictions with their uncertainty.
+
+        The free numbers are normal about the fit, with its covariance, as from a flat prior in them; so draws stay
+        within the bounds of `Positive` and `Bounded`.
+
+        **Arguments:** `key`: of `jax.random`. `count`: number of draws.
+
+        **Returns:** parameters in the structure of `params`, with a leading axis of draws.
+
+        **Raises:** `ValueError` for a fit without covariance, and for one of parameters that the data do not determine.
+        """
+        spread = self.determined()
+        if not np.all(np.isfinite(spread.deviation)):
+            raise ValueError(
+                f"the data do not determine {', '.join(map(repr, self.undetermined))}, so no draws can be made; fix "
+                "some, or add what is known of them to the residual"
+            )
+        return spread.draws(key, whole_number(count, "count"))
+
+    def determined(self) -> Spread:
+        """How far from the fit parameters may be.
+
+        **Raises:** `ValueError` for a fit without covariance.
+        """
+        if self.spread is None:
+            raise self._no_covariance()
+        return self.spread
 
     def predict(self, experiments: Experiment | Sequence[Experiment] | None = None) -> list[dict[str, np.ndarray]]:
         """What sensors would tell without noise, {channel: (n,) or (n, k)} of each experiment.

@@ -112,6 +112,15 @@ class FreeParameters(eqx.Module):
         ]
         return jax.tree.unflatten(self.structure, values)
 
+    def at(self, params: Any) -> Float[Array, " p"]:
+        """z of numbers in the structure of `params`; NaN or infinite where they are out of bounds."""
+        values = self.structure.flatten_up_to(params)
+        leaves = [
+            eqx.tree_at(lambda leaf: leaf.value, leaf, value) if isinstance(leaf, AbstractParameter) else value
+            for leaf, value in zip(self.leaves, values, strict=True)
+        ]
+        return eqx.tree_at(lambda free: free.leaves, self, leaves).start
+
     def vector(self, z: Float[Array, " p"]) -> Float[Array, " n"]:
         """All numbers of `params(z)`."""
         return ravel_pytree(self.params(z))[0]

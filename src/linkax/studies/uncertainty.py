@@ -1,7 +1,5 @@
 """Estimate the uncertainty of fitted parameters."""
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,17 +17,58 @@ DEPENDENT = 1e-8  # diagonal entry of R, relative to the largest, up to which it
 INVOLVED = 1e-3  # part of a parameter in a change that the data do not see, up to which it is not involved
 
 
+class Spread(NamedTuple):
+    """How far from a fit parameters may be; a function: level of confidence -> ends of the intervals.
+
+    - `free`, `z`: the parameters as functions of free numbers, and these as fitted, (p,).
+    - `covariance`: of the numbers, (n, n). `of_free`: of the free numbers, (p, p); zero where the data do not determine
+      them. `deviation`: their standard deviations, (p,), infinite there.
+    - `noise`: standard deviation of the residual. `freedom`: its degrees of freedom.
+    """
+
+    free: FreeParameters
+    z: Float[Array, " p"]
+    covariance: Float[np.ndarray, "n n"]
+    of_free: Float[np.ndarray, "p p"]
+    deviation: Float[np.ndarray, " p"]
+    noise: float
+    freedom: float
+
+    def quantile(self, level: float) -> float:
+        """How many standard deviations an interval reaches to each side, by Student's t distribution."""
+        from scipy.stats import t as student  # SciPy takes its time
+
+        return float(student.ppf(0.5 + level / 2.0, self.freedom))
+
+    def __call__(self, level: float) -> tuple[Any, Any]:
+        _, unravel = ravel_pytree(self.free.params(self.z))
+        times, ends = self.quantile(level), []
+        for sign in (-1.0, 1.0):
+            linear = np.asarray(self.free.vector(self.z)) + sign * times * np.sqrt(np.diagonal(self.covariance))
+            moved = np.asarray(self.free.vector(self.z + sign * times * self.deviation))
+            ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(np.where(self.free.apart, moved, linear)))))
+        return tuple(ends)
+
+    def draws(self, key: Array, count: int) -> Any:
+        """Parameters from the normal distribution of the free numbers, with a leading axis of `count`."""
+        scaled = self.of_free / np.outer(self.deviation, self.deviation)
+        values, vectors = np.linalg.eigh(scaled)
+        root = self.deviation[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        normal = jax.random.normal(key, (count, len(self.z)))
+        return jax.tree.map(np.asarray, jax.vmap(self.free.params)(self.z + normal @ root.T))
+
+
 class Uncertainty(NamedTuple):
     """Covariance of all parameters, and the names of those that the data do not determine.
 
     - `covariance`, `noise`, `undetermined`: see `linkax.Fit`.
-    - `spread`: level of confidence -> (lower, upper) ends of the intervals, in the structure of the parameters.
+    - `spread`: level of confidence -> (lower, upper) ends of the intervals, in the structure of the parameters; draws.
     """
 
     covariance: Float[np.ndarray, "n n"]
     noise: float
     undetermined: list[str]
-    spread: Callable[[float], tuple[Any, Any]]
+    spread: Spread
 
 
 class Scatter(NamedTuple):
@@ -91,17 +130,5 @@ def uncertainty(
     covariance[undetermined, undetermined] = np.inf
     deviation = np.sqrt(np.where(lost, np.inf, np.diagonal(of_free)))
     names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
-    return Uncertainty(covariance, scatter.noise, names, partial(_ends, free, z, covariance, deviation, freedom))
-
-
-def _ends(free, z, covariance, deviation, freedom, level):
-    """(lower, upper) ends of the intervals, from Student's t distribution."""
-    from scipy.stats import t as student  # SciPy takes its time
-
-    _, unravel = ravel_pytree(free.params(z))
-    times, ends = float(student.ppf(0.5 + level / 2.0, freedom)), []
-    for sign in (-1.0, 1.0):
-        linear = np.asarray(free.vector(z)) + sign * times * np.sqrt(np.diagonal(covariance))
-        moved = np.asarray(free.vector(z + sign * times * deviation))
-        ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(np.where(free.apart, moved, linear)))))
-    return tuple(ends)
+    spread = Spread(free, z, covariance, of_free, deviation, scatter.noise, freedom)
+    return Uncertainty(covariance, scatter.noise, names, spread)

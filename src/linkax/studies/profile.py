@@ -1,0 +1,191 @@
+"""Profile the likelihood of one parameter, refitting all others."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import ArrayLike, Float
+
+from linkax.model.numbers import is_finite, number, real, require, require_type, whole_number
+from linkax.studies.fit_result import Fit
+from linkax.studies.levenberg_marquardt import LevenbergMarquardt
+from linkax.studies.parameters import as_arrays
+from linkax.studies.profile_result import Profile
+from linkax.tables import one
+from linkax.xla.arrays import Array
+from linkax.xla.users_line import warn
+from linkax.xla.waiting import compiling
+
+LEVEL = 0.95  # of the interval that a profile is wide enough for
+WIDTH = 2.0  # of the values by default, in half widths of that interval
+UNKNOWN = 1.0  # the same for a parameter without standard error, in free numbers
+BETTER = 1e-3  # of the noise squared: by how much less a loss is that of another minimum
+
+
+def profile(
+    function: Callable,
+    found: Fit,
+    name: str,
+    args: tuple | list = (),
+    *,
+    values: ArrayLike | Sequence[float] | None = None,
+    count: int = 21,
+    steps: int = 100,
+    tolerance: int | float = 1e-6,
+) -> Profile:
+    """Refit all other parameters at each of several values of one: the profile of its likelihood.
+
+    Where the residual bends within the standard errors, intervals of `Fit` are wrong, and those of the profile follow
+    the likelihood (Bates and Watts, Nonlinear Regression Analysis and Its Applications, 1988, chapter 6). All refits
+    are one batch, by Levenberg and Marquardt's method, each from where the covariance puts the other parameters.
+
+    **Arguments:**
+
+    - `function`, `args`: the residual and its further arguments, as they were fitted. `found`: the `Fit`.
+    - `name`: of a number among `found.names`, such as "mass", or "springs[1]" of an array.
+    - `values`: of that number, (n,), in any order. By default `count` ones that reach twice as far as the interval of
+      95 %, or, where the data determine none, as far as the parameter itself.
+    - `steps`, `tolerance`: of each refit, as in `linkax.fit`.
+
+    **Returns:** a `Profile`. A refit that fails is marked, and harms no other.
+
+    **Raises:** `ValueError` for a fit without covariance, for a name that is none of its numbers or one of a
+    `PhysicalInertia`, which depends on others, for values that are not finite or out of bounds, and for a function that
+    does not have the residual of the fit.
+
+    **Warns:** where the profile does not rise to the threshold of 95 % on some side, as where the data do not determine
+    the number, and where some refit is better than the fit.
+    """
+    require_type(function, Callable, "function", "give the residual that was fitted, a function of (params, *args)")
+    require_type(found, Fit, "found", "give what linkax.fit returned")
+    spread = found.determined()
+    require_type(args, list | tuple, "args", "give a tuple of what else the function gets")
+    data = as_arrays(tuple(args), "args")
+    whole_number(steps, "steps")
+    finer = lambda x: x >= 0.0
+    tolerance = float(require(number(tolerance, (), "tolerance"), finer, "tolerance", "it must be zero or more"))
+    index, entry = _place(found, spread.free, name)
+    if values is None:
+        places = _default_places(spread, entry, whole_number(count, "count", least=3))
+    else:
+        places = _places_of(spread.free, spread.z, index, entry, _checked(values), name)
+    fixed = tuple(i for i in range(len(spread.z)) if i != entry)
+    starts = _starts(spread, entry, places, fixed)
+    with compiling():
+        z, losses, converged = _refitted(function, spread.free, data, fixed, entry, places, starts, steps, tolerance)
+        again = _loss(function, spread.free, data, spread.z)
+    _check_same(float(again), found.loss)
+    params = jax.tree.map(np.asarray, jax.vmap(spread.free.params)(z))
+    numbers = np.asarray(jax.vmap(spread.free.vector)(z)[:, index])
+    order = np.argsort(numbers)
+    result = Profile(
+        name=name,
+        best=float(np.asarray(spread.free.vector(spread.z))[index]),
+        values=numbers[order],
+        losses=np.asarray(losses)[order],
+        params=jax.tree.map(lambda leaf: leaf[order], params),
+        converged=np.asarray(converged)[order],
+        loss=found.loss,
+        noise=spread.noise,
+        freedom=spread.freedom,
+    )
+    _warn(result)
+    return result
+
+
+def _place(found, free, name) -> tuple[int, int]:
+    """Index of a number, and of the free number that it is a function of."""
+    if name not in found.names:
+        raise ValueError(f"name is {name!r}; known: {', '.join(map(repr, found.names))}")
+    index = found.names.index(name)
+    if not free.apart[index]:
+        raise ValueError(f"{name!r} is one of several numbers that depend on each other; choose another parameter")
+    return index, free.free_names.index(name)
+
+
+def _checked(values) -> Float[np.ndarray, " n"]:
+    array = np.asarray(real(values, "values"))
+    right = lambda array: is_finite(array) and array.ndim == 1 and array.size > 0
+    return np.asarray(require(array, right, "values", "give a list of finite numbers"))
+
+
+def _default_places(spread, entry, count):
+    """Of the free number: on both sides of the fit."""
+    width = WIDTH * spread.quantile(LEVEL) * spread.deviation[entry]
+    width = width if np.isfinite(width) else UNKNOWN
+    return jnp.asarray(spread.z[entry] + width * np.linspace(-1.0, 1.0, count))
+
+
+def _places_of(free, z, index, entry, values, name):
+    """Of the free number, at values of the number."""
+    _, unravel = ravel_pytree(free.params(z))
+    here = free.vector(z)
+    places = jax.vmap(lambda value: free.at(unravel(here.at[index].set(value)))[entry])(jnp.asarray(values))
+    for value, place in zip(values, np.asarray(places), strict=True):
+        if not np.isfinite(place):
+            raise ValueError(f"values hold {value}, which {name!r} cannot be; keep them within its bounds")
+    return places
+
+
+def _starts(spread, entry, places, others) -> Float[Array, "n q"]:
+    """The other free numbers, where the covariance puts them."""
+    variance = spread.of_free[entry, entry]
+    along = spread.of_free[list(others), entry] / variance if variance else 0.0
+    return jnp.asarray(np.asarray(spread.z)[list(others)] + np.outer(np.asarray(places) - spread.z[entry], along))
+
+
+@eqx.filter_jit
+def _loss(function, free, args, z):
+    return 0.5 * jnp.sum(_residual(function, free, args, z) ** 2)
+
+
+def _residual(function, free, args, z):
+    """With that of priors."""
+    return jnp.concatenate([ravel_pytree(function(free.params(z), *args))[0], free.prior(z)])
+
+
+@eqx.filter_jit
+def _refitted(function, free, args, others, entry, places, starts, steps, tolerance):
+    """z, loss, and whether it converged, of each refit."""
+    others, solver = jnp.array(others, int), LevenbergMarquardt(tolerance, tolerance)
+
+    def refit(place, start):
+        whole = lambda rest: jnp.zeros(len(free.start)).at[others].set(rest).at[entry].set(place)
+        residual = lambda rest, _: _residual(function, free, args, whole(rest))
+        rest, converged = start, jnp.array(True)
+        if len(others):
+            found = optx.least_squares(residual, solver, start, max_steps=steps, throw=False)
+            rest, converged = found.value, found.result == optx.RESULTS.successful
+        loss = 0.5 * jnp.sum(residual(rest, None) ** 2)
+        return whole(rest), loss, converged & jnp.isfinite(loss)
+
+    return jax.vmap(refit)(places, starts)
+
+
+def _check_same(loss, fitted):
+    if not np.isclose(loss, fitted, rtol=1e-6, atol=0.0):
+        raise ValueError(
+            f"function has the loss {one(loss)} at the fitted parameters, and the fit {one(fitted)}; give the residual "
+            "and the args that were fitted"
+        )
+
+
+def _warn(result: Profile):
+    """Warn where a profile is flat, or lower than the fit."""
+    lowest = np.min(result.losses[result.converged], initial=np.inf)
+    if lowest < result.loss - BETTER * result.noise**2:
+        warn(
+            f"a refit of the profile of {result.name!r} has the loss {one(lowest)}, the fit {one(result.loss)}: fit "
+            "again from there"
+        )
+    lower, upper = result.interval(LEVEL)
+    for end, side in ((lower, "below"), (upper, "above")):
+        if np.isinf(end):
+            warn(
+                f"the profile of {result.name!r} does not rise to the threshold of 95 % {side} {one(result.best)}: "
+                "give values further away; where it stays flat, the data do not determine the number"
+            )
