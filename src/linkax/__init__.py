@@ -114,6 +114,8 @@ from linkax.studies.comparison import Stepping as Stepping  # noqa: E402
 from linkax.studies.comparison import compare as compare  # noqa: E402
 from linkax.studies.comparison_result import Comparison as Comparison  # noqa: E402
 from linkax.studies.comparison_result import Trial as Trial  # noqa: E402
+from linkax.studies.design import design as design  # noqa: E402
+from linkax.studies.design_result import Design as Design  # noqa: E402
 from linkax.studies.differentiability import Differentiability as Differentiability  # noqa: E402
 from linkax.studies.differentiability import differentiability as differentiability  # noqa: E402
 from linkax.studies.experiments import Experiment as Experiment  # noqa: E402

@@ -166,7 +166,7 @@ def _is_loss(function, free, args) -> bool:
     **Raises:** `ValueError` where it returns nothing that can be minimised.
     """
     shape = eqx.filter_eval_shape(lambda z, args: function(free.params(z), *args), free.start, args)
-    _check_output(shape)
+    check_output(shape, "the function")
     return isinstance(shape, jax.ShapeDtypeStruct) and shape.shape == ()
 
 
@@ -242,24 +242,24 @@ def _warn(result: Fit):
         )
 
 
-def _check_output(shape):
-    """Raise a ValueError where what a function returns, as shapes, cannot be minimised."""
+def check_output(shape: Any, what: str) -> None:
+    """Raise a ValueError where what a function returns, as shapes, are no numbers that have a derivative."""
     kinds = {}
     for path, leaf in jax.tree.leaves_with_path(shape):
         name = jax.tree_util.keystr(path) or "its value"
         try:
             size, kinds[name] = np.prod(jnp.shape(leaf)), jnp.result_type(leaf)
         except TypeError as error:
-            raise ValueError(f"the function returned {leaf!r} in {name}; give real numbers") from error
+            raise ValueError(f"{what} returned {leaf!r} in {name}; give real numbers") from error
         if size == 0:
             del kinds[name]
         elif jnp.issubdtype(kinds[name], jnp.complexfloating):
-            raise ValueError(f"the function returned complex numbers in {name}; give their real and imaginary parts")
+            raise ValueError(f"{what} returned complex numbers in {name}; give their real and imaginary parts")
     if not kinds:
-        raise ValueError(f"the function returned {shape!r}, no numbers; give a residual or a loss")
+        raise ValueError(f"{what} returned {shape!r}, no numbers; give some")
     if not any(jnp.issubdtype(kind, jnp.floating) for kind in kinds.values()):
         raise ValueError(
-            f"the function returned {next(iter(kinds.values()))} in {next(iter(kinds))}, which has no derivative; give "
+            f"{what} returned {next(iter(kinds.values()))} in {next(iter(kinds))}, which has no derivative; give "
             "floating-point numbers"
         )
 
