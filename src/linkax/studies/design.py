@@ -15,7 +15,7 @@ from linkax.studies.design_result import Design
 from linkax.studies.fit import check_output
 from linkax.studies.free_parameters import FreeParameters
 from linkax.studies.parameters import AbstractParameter, Bounded, Positive
-from linkax.studies.uncertainty import uncertainty
+from linkax.studies.uncertainty import Scatter, uncertainty
 from linkax.xla.arrays import Array
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import Progress, compiling
@@ -228,6 +228,9 @@ def design(
     positive = lambda x: x > 0.0
     tolerance = float(require(number(tolerance, (), "tolerance"), positive, "tolerance", "it must be positive"))
     free = FreeParameters.of(_replaced(params, lambda leaf: leaf.value, Bounded, Positive))
+    if free.num_priors:
+        told = "give its number, and add number / standard deviation to the predictions"
+        raise ValueError(f"params hold a parameter with a prior, {', '.join(map(repr, free.names))}; {told}")
     boxed = lambda leaf: _Between(leaf.value, leaf.lower, leaf.upper)
     choices = FreeParameters.of(_replaced(design, boxed, Bounded))
     matters = _chosen(of, free)
@@ -301,7 +304,8 @@ def _checked_outputs(experiment) -> list[str]:
 def _covariance(experiment, found):
     """Covariance of the parameters, and those that are not determined, by sensitivities to noise of one."""
     finite = np.where(np.isfinite(found.slopes), found.slopes, 0.0)
-    return uncertainty(np.zeros(len(finite)), finite, experiment.free, experiment.free.start, noise=1.0)
+    scatter = Scatter(1.0, np.ones(len(finite)))
+    return uncertainty(np.zeros(len(finite)), finite, experiment.free, experiment.free.start, scatter)
 
 
 def _check_start(search, first, before, names):
