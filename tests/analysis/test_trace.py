@@ -128,11 +128,14 @@ def test_arc_length_through_turning_points(linkage):
     s = np.linspace(0.1, 12.0, 240)
     found = lx.trace(*linkage, arc_length=s)
     np.testing.assert_allclose(np.linalg.norm(found.v, axis=1), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.sum(found.v * found.v_rate, axis=1), 0.0, atol=1e-14)
     expected = jax.vmap(lambda a: rocker_angle(LENGTHS, a))(jnp.asarray(found.joint("A")))
     np.testing.assert_allclose(found.joint("D"), expected, rtol=0.0, atol=1e-12)
     assert np.ptp(found.joint("A")) > 2.0 * np.pi
     assert len(np.flatnonzero(np.diff(np.sign(found.joint_speed("D"))))) >= 2
-    np.testing.assert_allclose(np.diff(found.q, axis=0) / np.diff(s)[:, None], found.v[1:], atol=0.03)
+    middle, h = found.q[2:] - found.q[:-2], s[1] - s[0]
+    np.testing.assert_allclose(middle / (2.0 * h), found.v[1:-1], atol=2e-3)
+    np.testing.assert_allclose((found.v[2:] - found.v[:-2]) / (2.0 * h), found.v_rate[1:-1], atol=4e-3)
     assert lx.trace(*linkage, arc_length=-s).joint("A")[0] < 0.0
 
 
@@ -164,6 +167,12 @@ def test_singular_configurations_are_passed_and_told():
     np.testing.assert_allclose(found.joint_speed("D"), 1.0, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(found.joint_acceleration("D"), 0.0, rtol=0.0, atol=1e-11)
     np.testing.assert_array_equal(np.asarray(found.distance) < 1e-6, [0, 0, 0, 1, 0, 0, 0, 1, 0])
+    # From there, in the direction of the start's speeds, and with values twice.
+    flat = lx.assemble(mechanism, {"A": 0.0}, {"A": 1.0, "D": 1.0}, guess={"D": 0.0, "B": 0.0})
+    values = np.array([0.0, 0.0, 1.0, np.pi, np.pi, 3.5, 4.0, 5.0, 6.0])
+    found = lx.trace(mechanism, flat, {"A": values})
+    np.testing.assert_allclose(found.joint("D"), values, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found.joint_speed("D"), 1.0, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -251,12 +260,28 @@ def test_a_position_starts_a_run(linkage, turn, tmp_path):
         ({"along": {"coupler.tip": np.zeros((3, 2))}}, "coupler.tip"),
         ({"arc_length": [[1.0]]}, r"arc_length has shape \(1, 1\)"),
         ({"arc_length": [2.0, 1.0]}, "arc_length is .* rise or fall"),
+        ({"arc_length": [-1.0, 1.0, 2.0]}, "arc_length is .* rise or fall"),
         ({"along": {"A": [0.1]}, "throw": 1}, "throw is 1"),
+        ({"along": {"coupler": lx.Pose(np.zeros((2, 3)), [np.eye(3), np.ones((3, 3))])}}, "value 1 is none"),
     ],
 )
 def test_bad_input(linkage, given, told):
     with pytest.raises(ValueError, match=told):
         lx.trace(*linkage, **given)
+
+
+def test_what_is_no_ratio_of_forces(linkage):
+    mechanism, start = linkage
+    found = lx.trace(mechanism, start, arc_length=[0.1])
+    with pytest.raises(ValueError, match="the trace is along the arc length"):
+        found.mechanical_advantage("D")
+
+
+def test_single_precision_is_refused(linkage):
+    mechanism, start = linkage
+    single = lx.State(start.q.astype(np.float32), start.v.astype(np.float32))
+    with pytest.raises(ValueError, match="start is in float32"):
+        lx.trace(mechanism, single, {"A": [0.1]})
 
 
 def test_arc_length_needs_a_direction(linkage):
@@ -301,6 +326,8 @@ def test_bad_grids(five_bar):
         lx.workspace(*five_bar, {"b.tip": [0.0, 1.0]})
     with pytest.raises(ValueError, match=r"values of left have shape \(1, 2\)"):
         lx.workspace(*five_bar, {"left": [[0.0, 1.0]]})
+    with pytest.raises(ValueError, match="unknown joint or body 'lfet'"):
+        lx.workspace(*five_bar, {"lfet": [0.0, 1.0]})
     with pytest.raises(lx.TraceError, match="does not lead from the start to the nearest position"):
         lx.workspace(*five_bar, {"b.tip": ([3.0], [0.0], [0.0])})
     with pytest.raises(ValueError, match="must be known: leave jit"):

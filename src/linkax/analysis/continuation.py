@@ -11,29 +11,31 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
 from linkax.equations.system import System
-from linkax.linalg.saddle_inverse import invert
+from linkax.linalg.saddle_inverse import SaddleInverse, invert
 from linkax.model.constraints import Coupling
-from linkax.simulation.start.closing import LoopClosure, close_loops
+from linkax.simulation.start.closing import CLOSED, LoopClosure, close_loops
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
 from linkax.simulation.start.state import State
-from linkax.spatial.vectors import largest, length
+from linkax.spatial.vectors import dot, largest, length
 from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
-from linkax.xla.derivatives import ratio
+from linkax.xla.derivatives import positive_or_one, ratio
 
 MOST_CORRECTIONS = 5
 CONVERGED = 1e-8  # correction after which the next one is rounding [rad, lengths of the mechanism]
 FAITHFUL = 0.1  # largest correction of a step, relative to it, with which it is on the same branch
 ARC_CORRECTIONS = 3
+ANYHOW = 10.0 * CONVERGED  # correction that leads to no other branch
 OF_VALUES = 1e-2  # weight of values beside that of loops
+MOVES = 1e-6  # rate of rows, relative to that of coordinates, up to which it is none
+PROBE = 1e-4  # how far beside its start a way has the rank that it has elsewhere [rad, lengths of the mechanism]
 SHORTEST = 2.0**-10  # of the way from one position to the next
 
 
@@ -42,7 +44,7 @@ class Place(NamedTuple):
 
     - `q`: coordinates; `v`, `acceleration`: their first and second derivative by s.
     - `distance`: |R_rr| / |R₁₁| of all rows, zero where another branch crosses or what is asked for turns back.
-    - `rank`: of all rows, smaller there.
+    - `rank`: the largest of all rows, here and before; in a singular configuration itself it is smaller.
     """
 
     q: Float[Array, " n_q"]
@@ -55,19 +57,20 @@ class Place(NamedTuple):
         """The change of coordinates until s + h, but for the third power of h."""
         return h * self.v + 0.5 * h**2 * self.acceleration
 
-    def rates_ahead(self, h: Float[Array, ""]) -> "Rates":
-        """Derivatives at s + h, but for the second power of h, and the first."""
-        return Rates(self.v + h * self.acceleration, self.acceleration)
+    def before(self, h: Float[Array, ""]) -> "Before":
+        """What a place at s + h continues: derivatives but for the second power of h, and the first."""
+        return Before(self.v + h * self.acceleration, self.acceleration, self.rank)
 
 
-class Rates(NamedTuple):
-    """First and second derivative of coordinates by s, roughly: they choose where the rows leave them open.
+class Before(NamedTuple):
+    """How the way came to a place, which chooses the branch in a singular configuration.
 
-    Such is a branch in a singular configuration, and how fast a rod between two balls turns about itself.
+    - `v`, `acceleration`: first and second derivative of coordinates by s, roughly. `rank`: of all rows.
     """
 
     v: Float[Array, " n_v"]
     acceleration: Float[Array, " n_v"]
+    rank: Int[Array, ""]
 
 
 class Asked(NamedTuple):
@@ -136,31 +139,55 @@ class Way(eqx.Module):
         return LoopClosure(system, self.t, self.held.filled(values))
 
     @property
-    def weights(self) -> Float[np.ndarray, " n"]:
-        """Of rows: where the values contradict each other between two positions, the loops stay closed."""
-        values = len(self.held.slides())
-        rows = self.system.topology.num_rows + sum(len(kind.aligned_axes) for kind in self.system.topology.cut_types)
-        return np.concatenate([np.ones(rows), np.full(values, OF_VALUES)])
+    def num_loop_rows(self) -> int:
+        """Number of the rows of `LoopClosure` before those of values."""
+        topology = self.system.topology
+        return topology.num_rows + sum(len(kind.aligned_axes) for kind in topology.cut_types)
+
+    def in_scales(self, rows: Float[Array, "n ..."], weight: float = 1.0) -> Float[Array, "n ..."]:
+        """Rows of `LoopClosure`, with those of values in radians and lengths of the mechanism, times a weight."""
+        values = weight * jnp.where(self.held.slides(), 1.0 / self.system.length, 1.0)
+        factors = jnp.concatenate([jnp.ones(self.num_loop_rows, rows.dtype), values.astype(rows.dtype)])
+        return rows * factors.reshape(-1, *(1,) * (rows.ndim - 1))
 
     @straight_line
     def correction(
         self, q: Float[Array, " n_q"], values: Float[Array, " k"]
     ) -> tuple[Float[Array, " n_v"], Float[Array, ""], Float[Array, ""]]:
         """The change of q by one step of Newton's method, and how far off the loops and the values are."""
-        (rows, slopes), weights = self.demand(values).linearised(q), self.weights
-        nothing = jnp.zeros_like(self.system.scales)
-        step = nearest_solution(self.system, nothing, weights[:, None] * slopes, -weights * rows)
-        of_loops = weights == 1.0
-        return step, largest(rows[of_loops]), largest(rows[~of_loops])
+        rows, slopes = self.demand(values).linearised(q)
+        step = self.solution(jnp.zeros_like(self.system.scales), slopes, -rows)
+        gap, miss = jnp.split(self.in_scales(rows), [self.num_loop_rows])
+        return step, largest(gap), largest(miss)
+
+    def solution(
+        self, near: Float[Array, " n_v"], slopes: Float[Array, "n n_v"], right: Float[Array, " n"]
+    ) -> Float[Array, " n_v"]:
+        """Solve slopes @ y = right for the y nearest to another; of right sides that contradict each other, the loops'.
+
+        Values do, between two positions, where more are followed than the mechanism can move.
+        """
+        return nearest_solution(self.system, near, self.in_scales(slopes, OF_VALUES), self.in_scales(right, OF_VALUES))
+
+    def rank(self, q: Float[Array, " n_q"], values: Float[Array, " k"]) -> Int[Array, ""]:
+        """Of all rows."""
+        return self.split(self.demand(values).linearised(q)[1]).rank
+
+    def split(self, slopes: Float[Array, "n n_v"]) -> SaddleInverse:
+        """Split the space of speeds by all rows, in the identity metric."""
+        return invert(None, self.in_scales(slopes), self.system.scales, rank_tolerance(slopes.dtype))
 
     @straight_line
-    def place(self, q: Float[Array, " n_q"], asked: Asked, nearby: Rates) -> Place:
+    def place(self, q: Float[Array, " n_q"], asked: Asked, before: Before) -> Place:
         """How the way goes on from coordinates q on it.
 
-        **Arguments:** `nearby`: derivatives before, by any multiple of s.
+        **Arguments:** `before`: by any multiple of s.
         """
-        topology, scales, demand = self.system.topology, self.system.scales, self.demand(asked.values)
-        slopes, weights = demand.linearised(q)[1], self.weights
+        topology, scales = self.system.topology, self.system.scales
+        slopes = self.demand(asked.values).linearised(q)[1]
+        split = self.split(slopes)
+        # Where fewer rows are independent than before, they leave open which branch goes on.
+        is_singular, nothing = split.rank < before.rank, jnp.zeros_like(scales)
 
         def along(v):
             def rows(step):
@@ -171,19 +198,22 @@ class Way(eqx.Module):
             return rows
 
         here = jnp.zeros((), q.dtype)
-        opens = _rate(along(jnp.zeros_like(scales)), here)
+        opens = _rate(along(nothing), here)
         if self.held.groups:
-            # −opens are the rates that are asked for, and slopes @ v those of v.
-            before = slopes @ nearby.v
-            near = nearby.v * ratio(-(opens @ before), before @ before, 0.0)
-            v = nearest_solution(self.system, near, weights[:, None] * slopes, -weights * opens)
+            # −opens are the rates that are asked for, and `moves` those of the speeds before.
+            moves, size = self.in_scales(slopes @ before.v), dot(before.v / scales, before.v / scales)
+            moving = jnp.where(dot(moves, moves) > MOVES**2 * size, dot(moves, moves), 0.0)
+            near = before.v * ratio(-dot(self.in_scales(opens), moves), moving, 0.0)
+            v = self.solution(jnp.where(is_singular, near, nothing), slopes, -opens)
         else:
-            v = nearest_solution(self.system, nearby.v, slopes, -opens)
-            v = v / length(v / scales)
-        bends = weights * _rate(partial(_rate, along(v)), here)
-        acceleration = nearest_solution(self.system, nearby.acceleration, weights[:, None] * slopes, -bends)
-        split = invert(None, slopes, scales, rank_tolerance(q.dtype))
-        return Place(q, v, acceleration, split.distance, split.rank)
+            v = self.solution(before.v, slopes, -opens)
+            v = v / positive_or_one(length(v / scales))
+        bends = _rate(partial(_rate, along(v)), here)
+        acceleration = self.solution(jnp.where(is_singular, before.acceleration, nothing), slopes, -bends)
+        if not self.held.groups:
+            acceleration = acceleration - v * dot(acceleration / scales, v / scales)  # |v| is one
+        distance = jnp.where(is_singular, 0.0, split.distance)
+        return Place(q, v, acceleration, distance, jnp.maximum(split.rank, before.rank))
 
     def corrected(
         self, place: Place, h: Float[Array, ""], values: Float[Array, " k"], at_end: Bool[Array, ""]
@@ -191,7 +221,7 @@ class Way(eqx.Module):
         """Coordinates at s + h, and whether they lie on the same branch, and at the end of a piece have the values."""
         fastest, change = self.system.fastest, place.ahead(h)
         begin = retract(self.system.topology, place.q, change)
-        allowed = FAITHFUL * jnp.maximum(fastest(change), CONVERGED)
+        allowed = FAITHFUL * fastest(change) + ANYHOW
 
         def unfinished(carry):
             count, _, last, total = carry
@@ -213,11 +243,11 @@ class Way(eqx.Module):
         return q, (last <= CONVERGED) & (total <= allowed)
 
     def through(
-        self, q: Float[Array, " n_q"], nearby: Rates, piece: Piece, going: Bool[Array, ""]
-    ) -> tuple[Float[Array, " n_q"], Rates, Bool[Array, ""]]:
+        self, q: Float[Array, " n_q"], before: Before, piece: Piece, going: Bool[Array, ""]
+    ) -> tuple[Float[Array, " n_q"], Before, Bool[Array, ""]]:
         """Go from q through a piece, in as many steps as it takes.
 
-        **Returns:** coordinates and rough derivatives at its end, and whether that is reached.
+        **Returns:** coordinates at its end, how the way came there, and whether that is reached.
         """
 
         def unfinished(carry):
@@ -225,19 +255,28 @@ class Way(eqx.Module):
             return (u < 1.0) & (fraction >= SHORTEST)
 
         def advance(carry):
-            q, nearby, u, fraction = carry
+            q, before, u, fraction = carry
             to = jnp.where(u + 1.01 * fraction >= 1.0, 1.0, u + fraction)
             h = (to - u) * piece.h
-            place = self.place(q, piece.at(u), nearby)
+            place = self.place(q, piece.at(u), before)
             there, reached = self.corrected(place, h, piece.at(to).values, to == 1.0)
             longer = jnp.where(reached, jnp.minimum(2.0 * fraction, 1.0), 0.5 * fraction)
-            moved = there, place.rates_ahead(h), to
-            q, nearby, u = jax.tree.map(lambda new, old: jnp.where(reached, new, old), moved, (q, nearby, u))
-            return q, nearby, u, longer
+            # What does not move has no direction.
+            moves = self.system.fastest(place.v) > 0.0
+            came = jax.tree.map(lambda new, old: jnp.where(moves, new, old), place.before(h), before)
+            moved = there, came, to
+            q, before, u = jax.tree.map(lambda new, old: jnp.where(reached, new, old), moved, (q, before, u))
+            return q, before, u, longer
 
         begin = jnp.where(going, 0.0, 1.0).astype(q.dtype)
-        q, nearby, _, fraction = lax.while_loop(unfinished, advance, (q, nearby, begin, jnp.ones_like(begin)))
-        return q, nearby, going & (fraction >= SHORTEST)
+        q, before, _, fraction = lax.while_loop(unfinished, advance, (q, before, begin, jnp.ones_like(begin)))
+        return q, before, going & (fraction >= SHORTEST)
+
+    def start(self, start: State, own: Float[Array, " k"]) -> Before:
+        """How a way comes to its start: by the speeds there; the rank is that a little farther on."""
+        ahead = start.v * ratio(jnp.full((), PROBE, start.v.dtype), self.system.fastest(start.v), 0.0)
+        rank = self.rank(retract(self.system.topology, start.q, ahead), own)
+        return Before(start.v, jnp.zeros_like(start.v), rank)
 
 
 def _rate(function, at):
@@ -255,16 +294,19 @@ def follow_values(
     **Arguments:** `own`: values of what is held at the start; `going`: whether the way begins there.
     """
     given = lax.stop_gradient((way, start, own, s, asked, going))
-    found, nearby, reached = lax.stop_gradient(_search(*given))
+    found, before, reached = lax.stop_gradient(_search(*given))
 
-    def at(found, asked, nearby):
-        return way.place(close_loops(way.demand(asked.values), found, found), asked, nearby)
+    def at(found, asked, before):
+        demand = way.demand(asked.values)
+        met = length(demand.rows_at(found)) <= CLOSED  # up to which there are derivatives
+        return way.place(close_loops(demand, found, found), asked, before), lax.stop_gradient(met)
 
-    return jax.vmap(at)(found, asked, nearby), reached
+    places, met = jax.vmap(at)(found, asked, before)
+    return places, reached & (jnp.cumsum(~met) == 0)
 
 
 def _search(way, start, own, s, asked, going):
-    """Coordinates and rough derivatives for each s, and whether they are reached."""
+    """Coordinates for each s, how the way comes there, and whether it does."""
     approach = jax.tree.map(lambda array: array[None], Piece.straight(own, asked.values[0]))
     begin, end = (jax.tree.map(lambda array, part=part: array[part], asked) for part in (slice(-1), slice(1, None)))
     pieces = jax.tree.map(lambda *parts: jnp.concatenate(parts), approach, Piece.between(jnp.diff(s), begin, end))
@@ -273,8 +315,7 @@ def _search(way, start, own, s, asked, going):
         carry = way.through(*carry[:2], piece, carry[2])
         return carry, carry
 
-    nearby = Rates(start.v, jnp.zeros_like(start.v))
-    return lax.scan(advance, (start.q, nearby, going), pieces)[1]
+    return lax.scan(advance, (start.q, way.start(start, own), going), pieces)[1]
 
 
 def follow_arc(
@@ -291,16 +332,19 @@ def follow_arc(
 
     def advance(carry, h):
         place, going = carry
+        h = jnp.where(going, h, 0.0)
         change = place.ahead(h)
         q, total, last = retract(way.system.topology, place.q, change), 0.0, 0.0
         for _ in range(ARC_CORRECTIONS):
             step, gap, _ = way.correction(q, nothing)
             q, last = retract(way.system.topology, q, step), jnp.maximum(way.system.fastest(step), gap)
             total = total + last
-        there = way.place(q, nowhere, place.rates_ahead(h))
-        faithful = total <= FAITHFUL * jnp.maximum(way.system.fastest(change), CONVERGED)
+        there = way.place(q, nowhere, place.before(h))
+        faithful = total <= FAITHFUL * way.system.fastest(change) + ANYHOW
         going = going & faithful & (last <= CONVERGED)
-        return (there, going), (there, going)
+        place = jax.tree.map(lambda new, old: jnp.where(going, new, old), there, place)
+        return (place, going), (place, going)
 
-    begin = way.place(start.q, nowhere, Rates(start.v, jnp.zeros_like(start.v))), going
-    return lax.scan(advance, begin, jnp.diff(s, prepend=0.0))[1]
+    begin = way.place(start.q, nowhere, way.start(start, nothing))
+    moves = way.system.fastest(begin.v) > 0.0
+    return lax.scan(advance, (begin, going & moves), jnp.diff(s, prepend=0.0))[1]

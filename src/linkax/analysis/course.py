@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Bool, Float
 
 from linkax.analysis.continuation import Asked
 from linkax.equations.configuration import Configuration
@@ -18,7 +18,9 @@ from linkax.model.poses import Pose
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.places import Places
 from linkax.simulation.start.validation import coordinates_by_joint
+from linkax.spatial.quaternions import normalised
 from linkax.xla.arrays import Array
+from linkax.xla.tracing import concrete
 
 
 class Course(NamedTuple):
@@ -37,14 +39,14 @@ class Course(NamedTuple):
     def along(held: JointValues, values: Float[Array, "n k"]) -> "Course":
         """Through values of what is held."""
         n, k = values.shape
+        values = _continuous(held, values)
         if k == 1:
             return Course(held, values[:, 0], Asked(values, jnp.ones((n, 1)), jnp.zeros((n, 1))))
-        values = _continuous(held, values)
         slopes, bends = _spline(n)
         return Course(held, jnp.arange(float(n)), Asked(values, slopes @ values, bends @ values))
 
     @staticmethod
-    def by_arc(arc_length: ArrayLike) -> "Course":
+    def by_arc(arc_length: ArrayLike | Sequence[float]) -> "Course":
         """Check arc lengths.
 
         **Raises:** `ValueError` for what is no row of finite numbers that rise or fall from zero.
@@ -53,8 +55,12 @@ class Course(NamedTuple):
         s = real(arc_length, what)
         if s.ndim != 1 or not len(s):
             raise ValueError(f"{what} has shape {s.shape}; give a row of numbers, such as np.linspace(0.0, 5.0, 100)")
-        in_order = lambda s: is_finite(s) & ((namespace(s).diff(s) > 0.0).all() | (namespace(s).diff(s) < 0.0).all())
-        one_way = lambda s: in_order(s) & (namespace(s).abs(s[-1]) >= namespace(s).abs(s[0]))
+
+        def one_way(s):
+            steps = namespace(s).diff(s, prepend=0.0)
+            rises, falls = steps[1:] > 0.0, steps[1:] < 0.0
+            return is_finite(s) & ((rises.all() & (s[0] >= 0.0)) | (falls.all() & (s[0] <= 0.0)))
+
         s = require(s, one_way, what, "they must be finite, and rise or fall from the start, where they are zero")
         nothing = jnp.zeros((len(s), 0))
         return Course(JointValues((), ()), jnp.asarray(s), Asked(nothing, nothing, nothing))
@@ -81,7 +87,11 @@ def values_along(mechanism: Mechanism, along: Mapping[Any, Any]) -> tuple[Mechan
         return coordinates_by_joint(places.measured(), terms, "along")
 
     held = of_row({key: jax.tree.map(lambda array: array[0], entry) for key, entry in rows.items()})
-    return places.measured(), held, jax.vmap(lambda row: of_row(row).flat())(rows)
+    values = jax.vmap(lambda row: of_row(row).flat())(rows)
+    if (known := concrete(values)) is not None and not np.all(np.isfinite(known)):
+        row = int(np.flatnonzero(~np.isfinite(known).all(axis=1))[0])
+        raise ValueError(f"along: value {row} is none; its quaternion is zero, or its orientation no rotation")
+    return places.measured(), held, values
 
 
 def own_values(near: JointValues, configuration: Configuration) -> Float[Array, " k"]:
@@ -133,14 +143,25 @@ def _checked(key, entry):
 
 
 def _continuous(held, values):
-    """The same values, with signs of quaternions that do not jump."""
+    """The same values, with signs of quaternions, and turns of cut joints' angles, that do not jump."""
     for _, start, _, by_quaternion in _places(held):
         if by_quaternion:
-            quaternions = values[:, start : start + 4]
+            quaternions = normalised(values[:, start : start + 4])
             flips = jnp.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
             signs = jnp.cumprod(jnp.concatenate([jnp.ones(1), jnp.where(flips, -1.0, 1.0)]))
-            values = values.at[:, start : start + 4].multiply(signs[:, None])
-    return values
+            values = values.at[:, start : start + 4].set(signs[:, None] * quaternions)
+    return jnp.where(wraps(held), jnp.unwrap(values, axis=0), values)
+
+
+def wraps(held: JointValues) -> Bool[np.ndarray, " k"]:
+    """Which values are angles of cut joints, which are the same after a turn."""
+    found = []
+    for alike in held.groups:
+        angles = [unit == "rad" and not alike.in_tree for unit in alike.units]
+        if alike.kind.has_quaternion and alike.index is None:
+            angles = [False] * 4 + angles[3:]
+        found += angles * len(alike.terms)
+    return np.array(found, dtype=bool)
 
 
 def _places(held):

@@ -1,6 +1,6 @@
 """Kinematics without time: `linkax.trace` follows closed loops along values of joints or places, or by arc length."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -35,7 +35,7 @@ from linkax.straight_line.known import flat_with_known
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.program import Program
-from linkax.xla.tracing import all_concrete, is_first
+from linkax.xla.tracing import all_concrete, concrete, is_first
 from linkax.xla.waiting import compiling
 
 Values = Mapping[str, ArrayLike | list[Any] | Pose] | Mapping[TermLike, ArrayLike | list[Any] | Pose]
@@ -73,9 +73,9 @@ class Trace(Kinematics):
     - `q`: coordinates of the tree's joints, (n, n_q); `v`, `v_rate`: their first and second derivative by s,
       (n, n_v). So `joint_speed`, `velocity` and the like are by s, `joint_acceleration` and `acceleration` by s².
     - `distance`: |R_rr| / |R₁₁| of the loops' rows and of what is followed, (n,): zero where another branch crosses, or
-      what is followed turns back. `singularity_distance()` is that of the loops alone.
+      what is followed turns back. It has no derivative. `singularity_distance()` is that of the loops alone.
     - `result`: `linkax.RESULTS.successful`, or why positions are missing.
-    - `along`: what is followed, in words.
+    - `along`: what is followed, in words. `by_joint`: whether that is one coordinate of a joint.
     """
 
     by_time = ("ts", "q", "v", "v_rate", "distance")
@@ -88,6 +88,7 @@ class Trace(Kinematics):
     distance: Float[Array, "*batch n_t"]
     result: Any
     along: str = eqx.field(static=True)
+    by_joint: bool = eqx.field(static=True)
     rank_nearby: Int[Array, "*batch k"] | None = None
 
     @property
@@ -107,8 +108,15 @@ class Trace(Kinematics):
         way counts, whatever its direction.
 
         Infinite in a dead point, where the output stands still.
+
+        **Raises:** `ValueError` for a trace along anything but one coordinate of a joint, which is the input, and for
+        an output with several coordinates.
         """
+        if not self.by_joint:
+            raise ValueError(f"the trace is along {self.along}; trace along one coordinate of a joint, the input")
         if at is None and output in self.mechanism.topology.joints:
+            if (count := len(self.mechanism.joint(output).speed_units)) != 1:
+                raise ValueError(f"output {output!r} has {count} coordinates; give a joint with one, or a body")
             return 1.0 / self.joint_speed(output)
         return 1.0 / length(self.velocity(output, at))
 
@@ -140,20 +148,20 @@ class Trace(Kinematics):
         axis = self._axis(moving)
         along = tip - base
         way = axis if isinstance(moving, Prismatic) else cross(axis, tip - self._origin(moving))
-        return jnp.arcsin(jnp.clip(jnp.abs(dot(along, way)) / (length(along) * length(way)), 0.0, 1.0))
+        return jnp.arctan2(jnp.abs(dot(along, way)), length(cross(along, way)))
 
     def _origin(self, joint):
         """Where a joint is, in ground axes, (n, 3)."""
         end = joint.child if joint.child.body in self.mechanism.topology.bodies else joint.parent
-        return self.position(end.body, end.offset)
+        pose = self.poses()[end.body]
+        return pose.position + (pose.orientation @ jnp.asarray(end.offset)[..., None, :, None])[..., 0]
 
     def _axis(self, joint):
         """Axis of a joint, in ground axes, (n, 3)."""
         parent, child = joint.frames()
-        frame, axes = (
-            (joint.child, child) if joint.child.body in self.mechanism.topology.bodies else (joint.parent, parent)
-        )
-        return self.orientation(frame.body) @ jnp.asarray(axes)[:, 0]
+        on_child = joint.child.body in self.mechanism.topology.bodies
+        end, axes = (joint.child, child) if on_child else (joint.parent, parent)
+        return self.poses()[end.body].orientation @ jnp.asarray(axes)[:, 0]
 
 
 def trace(
@@ -161,7 +169,7 @@ def trace(
     start: State,
     along: Values | None = None,
     *,
-    arc_length: ArrayLike | None = None,
+    arc_length: ArrayLike | Sequence[float] | None = None,
     t: Number = 0.0,
     throw: bool = True,
 ) -> Trace:
@@ -200,7 +208,7 @@ def trace(
     `ValueError` for bad arguments.
     """
     require_bool(throw, "throw")
-    start, t = checked_state(mechanism, start), jnp.asarray(checked_time(t, "t"))
+    start, t = start_of(mechanism, start), jnp.asarray(checked_time(t, "t"))
     if along is not None and arc_length is None:
         measured, held, values = values_along(mechanism, along)
         course = Course.along(held, values)
@@ -215,36 +223,49 @@ def trace(
         raise ValueError(f"trace got {given}; give one of them, such as along={{'crank': values}}")
     given = flat_with_known(measured), start, course, t
     with compiling(all_concrete(given) and is_first(trace, jax.tree.structure(given))):
-        rows, result = _traced(*given)
+        rows, result, freedom = _traced(*given)
+    if along is None and (ways := concrete(freedom)) is not None and ways > 1:
+        raise ValueError(f"the mechanism can move in {ways} ways, and arc_length follows one; give along=, or drives")
     run = Run.of_state(mechanism, start, t, DEFAULT_FORMULATION, BALANCED)
-    s, q, v, v_rate, distance = rows
-    found = Trace(run=run, ts=s, q=q, v=v, v_rate=v_rate, distance=distance, result=result, along=what)
+    named = dict(zip(Trace.by_time, rows, strict=True))
+    found = Trace(run=run, **named, result=result, along=what, by_joint=course.asked.values.shape[1] == 1)
     if throw and all_concrete(found) and not np.all(np.isfinite(found.ts)):
         raise TraceError(_stopped(found, course), found)
     return found
 
 
+def start_of(mechanism: Mechanism, start: State) -> State:
+    """Check the state where a way begins.
+
+    **Raises:** `ValueError` for one that is none, or that is in single precision, with loops too far open.
+    """
+    start = checked_state(mechanism, start)
+    if start.q.dtype != np.float64:
+        raise ValueError(f"start is in {start.q.dtype}; make it with linkax.assemble, in double precision")
+    return start
+
+
 @Program
 def _traced(flat, start, course, t):
-    """s, the places, and the result."""
+    """s, the places, the result, and in how many ways the mechanism can move."""
     system = system_of(flat, start.q.dtype)
     way = Way(system, t, course.held, followed_drives(course.held, system.constraints))
     own = own_values(course.held, configure(system, t, start.q))
     demand = way.demand(own)
     closed = gaps(configure(demand.system, t, start.q)).in_scales(system).widest() <= CLOSED
-    sound = jnp.all(jnp.isfinite(start.v)) & sound_numbers(flat.tree) & jnp.all(jnp.isfinite(course.s))
+    sound = sound_numbers(flat.tree) & jnp.all(jnp.isfinite(course.s)) & jnp.all(jnp.isfinite(course.asked.values))
+    sound = sound & jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.v))
     if course.held.groups:
         place, reached = follow_values(way, start, own, course.s, course.asked, closed & sound)
     else:
         place, reached = follow_arc(way, start, course.s, closed & sound)
-    most = jnp.max(jnp.where(reached, place.rank, 0))
-    place = place._replace(distance=jnp.where(place.rank < most, 0.0, place.distance))
     there = lambda array: jnp.where(reached.reshape(-1, *(1,) * (array.ndim - 1)), array, jnp.inf)
     result = RESULTS.where(jnp.all(reached), *ENDS)
     result = RESULTS.where(closed, result, RESULTS.not_closed)
     result = RESULTS.where(sound, result, RESULTS.not_finite)
     result = RESULTS.where(jnp.any(jnp.isinf(start.v)), RESULTS.not_assembled, result)
-    return [*map(there, (course.s, *place[:4]))], result
+    freedom = system.topology.num_speeds - len(system.topology.spinning) - jnp.max(place.rank)
+    return [*map(there, (course.s, *place[:4]))], result, freedom
 
 
 def _stopped(found, course):
@@ -256,8 +277,8 @@ def _stopped(found, course):
     shown = lambda row: numbers(values[row], axes=1)
     if not reached:
         return (
-            f"the trace along {found.along} does not reach the first value, {shown(0)}, from the start; start nearer, "
-            "on its branch"
+            f"the trace along {found.along} does not reach the first value, {shown(0)}, from the start{_held(found)}; "
+            "start nearer, on its branch, and follow no more coordinates than can be chosen"
         )
     remedy = "give values up to there, or throw=False for the part that is reached"
     if course.held.groups:
@@ -266,5 +287,11 @@ def _stopped(found, course):
         remedy = f"give closer values, or {remedy}"
     return (
         f"the trace along {found.along} stops between {shown(reached - 1)} and {shown(reached)}, position {reached} of "
-        f"{len(values)}: the branch turns back there, or ends where another crosses; {remedy}"
+        f"{len(values)}: the branch turns back there, or ends where another crosses{_held(found)}; {remedy}"
     )
+
+
+def _held(found):
+    """Drives that may be in the way."""
+    names = [each.display_name for each in found.mechanism.constraints if each.is_driven]
+    return f", where {' and '.join(names)} of other joints stands still" if names else ""

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from linkax.analysis.continuation import Asked, Piece, Rates, Way
-from linkax.analysis.course import followed_drives, own_values, values_along
-from linkax.analysis.trace import TraceError
+from linkax.analysis.continuation import Asked, Before, Piece, Way
+from linkax.analysis.course import followed_drives, own_values, values_along, wraps
+from linkax.analysis.trace import TraceError, start_of
 from linkax.equations.configuration import configure
 from linkax.equations.system import system_of
 from linkax.model.mechanism import Mechanism
@@ -19,8 +19,9 @@ from linkax.model.numbers import Number, real, require_type
 from linkax.simulation.integrate.accuracy import BALANCED
 from linkax.simulation.integrate.run import DEFAULT_FORMULATION, Run
 from linkax.simulation.read.kinematics import Kinematics
+from linkax.simulation.start.places import Places
 from linkax.simulation.start.state import State
-from linkax.simulation.start.validation import checked_state, checked_time
+from linkax.simulation.start.validation import checked_time
 from linkax.straight_line.known import flat_with_known
 from linkax.tables import Rows, Table, numbers, printed_as
 from linkax.xla.arrays import Array
@@ -96,48 +97,83 @@ def workspace(
     **Raises:** `TraceError` where the branch does not lead from the start to the nearest position; `ValueError` for bad
     arguments, and where numbers are traced.
     """
-    start, t = checked_state(mechanism, start), jnp.asarray(checked_time(t, "t"))
+    if not all_concrete((mechanism, start, along, t)):
+        raise ValueError("workspace of numbers that JAX traces; which positions are reached must be known: leave jit")
+    start, t = start_of(mechanism, start), jnp.asarray(checked_time(t, "t"))
     axes, rows = _axes(mechanism, along)
     measured, held, values = values_along(mechanism, rows)
     given = flat_with_known(measured), start, held, values, t
-    if not all_concrete(given):
-        raise ValueError("workspace of numbers that JAX traces; which positions are reached must be known: leave jit")
     shape, values = tuple(len(entries) for _, entries in axes), np.asarray(values)
-    q, found, spacing = np.zeros((len(values), len(start.q))), np.zeros(len(values), bool), _spacing(values)
+    way = given[0], held, t
     with Progress(len(values), "position", progress) as line:
         with compiling(is_first(workspace, jax.tree.structure(given))):
-            own = np.asarray(_own(given[0], start, held.filled(jnp.asarray(values[0])), t))
-            nearest = int(np.argmin(np.sum(((values - own) / spacing) ** 2, axis=1)))
-            step = lambda q, begin, end: _step(given[0], held, t, q, begin, end)
-            (q[nearest],), (reached,) = _together(step, np.asarray(start.q)[None], own[None], values[nearest][None])
-        if not reached:
+            own, came = _begin(*way, start, values[0])
+            apart = values - own
+            apart = np.where(wraps(held), np.remainder(apart + np.pi, 2.0 * np.pi) - np.pi, apart)
+            first = int(np.argmin(np.sum((apart / _spacing(values)) ** 2, axis=1)))
+            search = _Search(way, values, start.q, came)
+            search.step([(None, first)], values[first] - apart[first])
+        if not search.found[first]:
             raise TraceError(
-                f"the branch does not lead from the start to the nearest position of the grid, "
-                f"{numbers(values[nearest], axes=1)}; give a grid around the start, or a start on its branch"
+                "the branch does not lead from the start to the nearest position of the grid, "
+                f"{numbers(values[first], axes=1)}; give a grid around the start, or a start on its branch"
             )
-        found[nearest], frontier = True, [(nearest, beside) for beside in _beside(nearest, shape)]
-        while frontier:
-            begin, end = (np.array(part) for part in zip(*frontier, strict=True))
-            there, reached = _together(step, q[begin], values[begin], values[end])
-            new = []
-            for to, place, is_there in zip(end.tolist(), there, reached, strict=True):
-                if is_there and not found[to]:
-                    q[to], found[to] = place, True
-                    new.append(to)
-            frontier = [(place, beside) for place in new for beside in _beside(place, shape) if not found[beside]]
-            line.tell("searching", int(np.sum(found)))
-    distance = np.concatenate([*_in_parts(lambda *at: _distance(given[0], held, t, *at), q, values)])
+        waiting = [(first, beside) for beside in _beside(first, shape)]
+        while waiting:
+            chosen = {end: begin for begin, end in reversed(waiting) if not search.found[end]}
+            new = search.step([(begin, end) for end, begin in chosen.items()])
+            tried = {(begin, end) for end, begin in chosen.items()}
+            waiting = [pair for pair in waiting if pair not in tried and not search.found[pair[1]]]
+            waiting += [(place, beside) for place in new for beside in _beside(place, shape)]
+            line.tell("searching", int(np.sum(search.found)))
+    found = search.found
     mark = lambda array: np.where(found.reshape(-1, *(1,) * (array.ndim - 1)), array, np.inf)
-    run = Run.of_state(mechanism, start, t, DEFAULT_FORMULATION, BALANCED)
     return Workspace(
-        run=run,
-        ts=mark(np.arange(float(len(q)))),
-        q=mark(q),
-        v=np.full((len(q), len(start.v)), np.nan),
-        distance=mark(distance),
+        run=Run.of_state(mechanism, start, t, DEFAULT_FORMULATION, BALANCED),
+        ts=mark(np.arange(float(len(values)))),
+        q=mark(search.q),
+        v=np.full((len(values), len(start.v)), np.nan),
+        distance=mark(search.distances()),
         axes=axes,
         reached=found.reshape(shape),
     )
+
+
+class _Search:
+    """Which positions are found, where the joints are there, and how the ways came there.
+
+    `way`: the mechanism, what is held, and time; `values`: of all positions, (N, k).
+    """
+
+    def __init__(self, way: tuple[Any, ...], values: Float[np.ndarray, "n k"], q: Any, came: Before) -> None:
+        self.way, self.values, self.start, count = way, values, (np.asarray(q), *map(np.asarray, came)), len(values)
+        self.found = np.zeros(count, bool)
+        self.q, *self.came = (np.repeat(array[None], count, axis=0) for array in self.start)
+
+    def step(self, pairs: list[tuple[int | None, int]], own: Float[np.ndarray, " k"] | None = None) -> list[int]:
+        """Go from positions to those beside them, or from the start with its `own` values; return those found."""
+        if not pairs:
+            return []
+        ends = np.array([end for _, end in pairs])
+        if own is None:
+            begins = np.array([begin for begin, _ in pairs])
+            given = self.q[begins], self.values[begins], self.values[ends], *(array[begins] for array in self.came)
+        else:
+            q, *came = (array[None] for array in self.start)
+            given = q, own[None], self.values[ends], *came
+        q, *came, reached = _together(lambda *rows: _step(*self.way, *rows), *given)
+        new = ends[reached]
+        self.found[new] = True
+        for array, rows in zip((self.q, *self.came), (q, *came), strict=True):
+            array[new] = rows[reached]
+        return new.tolist()
+
+    def distances(self) -> Float[np.ndarray, " n"]:
+        """Of the positions found from singular configurations; zero for others."""
+        rows = self.q[self.found], self.values[self.found], *(array[self.found] for array in self.came)
+        distance = np.zeros(len(self.found))
+        distance[self.found] = np.concatenate([*_in_parts(lambda *rows: _distance(*self.way, *rows), *rows)])
+        return distance
 
 
 def _axes(mechanism, along):
@@ -149,6 +185,8 @@ def _axes(mechanism, along):
     axes, whose = [], []
     for key, entry in along.items():
         is_place = isinstance(key, str) and key not in mechanism.topology.joints
+        if is_place:
+            Places(mechanism).positions({key: np.zeros(3)}, "along")  # which tells of an unknown name
         if is_place and not (isinstance(entry, tuple | list) and len(entry) == 3):
             raise ValueError(f"along: values of {key!r} are {entry!r}; give those of each axis, (x, y, [0.0])")
         names = [f"{key} {name}" for name in "xyz"] if is_place else [str(key)]
@@ -194,33 +232,37 @@ def _in_parts(function, *rows):
         yield jax.tree.map(lambda array, count=count: np.asarray(array)[:count], function(*filled))
 
 
-@Program
-def _own(flat, start, near, t):
-    return own_values(near, configure(system_of(flat, start.q.dtype), t, start.q))
+def _way(flat, held, t):
+    system = system_of(flat, np.float64)
+    return Way(system, t, held, followed_drives(held, system.constraints))
 
 
 @Program
-def _step(flat, held, t, q, begin, end):
-    """Coordinates at values `end` from those at `begin`, and whether these are reached, of many pairs."""
-    system = system_of(flat, q.dtype)
-    way = Way(system, t, held, followed_drives(held, system.constraints))
-
-    def step(q, begin, end):
-        rest = jnp.zeros(system.topology.num_speeds, q.dtype)
-        there, _, reached = way.through(q, Rates(rest, rest), Piece.straight(begin, end), jnp.ones((), bool))
-        return there, reached
-
-    return jax.vmap(step)(q, begin, end)
+def _begin(flat, held, t, start, near):
+    """Values of what is held at the start, near to others, and how the ways begin there."""
+    way = _way(flat, held, t)
+    own = own_values(held.filled(near), configure(way.system, t, start.q))
+    return own, way.start(start, own)
 
 
 @Program
-def _distance(flat, held, t, q, values):
-    system = system_of(flat, q.dtype)
-    way = Way(system, t, held, followed_drives(held, system.constraints))
+def _step(flat, held, t, q, begin, end, *came):
+    """Coordinates at values `end` from those at `begin`, how the way came there, and whether it did, of many pairs."""
+    way = _way(flat, held, t)
 
-    def of(q, values):
-        rest = jnp.zeros(system.topology.num_speeds, q.dtype)
+    def step(q, begin, end, *came):
+        there, came, reached = way.through(q, Before(*came), Piece.straight(begin, end), jnp.ones((), bool))
+        return there, *came, reached
+
+    return jax.vmap(step)(q, begin, end, *came)
+
+
+@Program
+def _distance(flat, held, t, q, values, *came):
+    way = _way(flat, held, t)
+
+    def of(q, values, *came):
         still = jnp.zeros_like(values)
-        return way.place(q, Asked(values, still, still), Rates(rest, rest)).distance
+        return way.place(q, Asked(values, still, still), Before(*came)).distance
 
-    return jax.vmap(of)(q, values)
+    return jax.vmap(of)(q, values, *came)
