@@ -272,3 +272,11 @@ def test_swings_with_initial_angles_of_their_own():
     assert abs(found.params["delay"] - 0.02) < 4.0 * found.standard_errors["delay"] < 2e-3
     np.testing.assert_allclose(found.params["starts"], truth["starts"], atol=1e-3)
     np.testing.assert_allclose(found.noises["encoder"], 1e-3, rtol=0.2)
+
+
+def test_noise_is_no_parameter():
+    sensors = lambda params: {"angle": lx.Encoder("hinge", noise=params["noise"])}
+    model = lambda params: pytest.fail("the model is not needed to say so")
+    experiment = lx.Experiment(model, {"angle": ([0.0, 0.1], [0.0, 0.1])}, sensors)
+    with pytest.raises(ValueError, match="noise of channel 'angle' is a parameter"):
+        lx.fit(experiment, {"noise": lx.Positive(0.1)})

@@ -148,3 +148,20 @@ def test_bad_profiles_are_named(name):
 def test_values_out_of_bounds_are_named():
     found, args = fitted_from({"slope": lx.Bounded(0.4, 0.0, 1.0), "at_zero": 1.0})
     refused(lambda: lx.profile(line, found, "slope", args, values=[0.5, 1.5]), "1.5", "slope", "bounds")
+
+
+def test_a_prior_is_a_part_of_the_likelihood():
+    """Of a number that the data do not touch, the interval is that of the prior."""
+    measured = 1.0 + 0.1 * np.random.default_rng(0).normal(size=20)
+    residual = lambda params, measured: (params["mean"] - measured) / 0.1
+    found = lx.fit(residual, {"mean": 0.5, "free": lx.Normal(1.0, 0.3)}, (measured,), progress=False)
+    lower, upper = lx.profile(residual, found, "free", (measured,)).interval(0.95)
+    wide = 0.3 * student.ppf(0.975, 19)
+    np.testing.assert_allclose([lower, upper], [1.0 - wide, 1.0 + wide], rtol=1e-3)
+
+
+def test_what_cannot_be_profiled():
+    residual = lambda params: params["x"] - jnp.array([1.0, 1.1, 0.9])
+    found = lx.fit(residual, {"x": 0.5}, progress=False)
+    with pytest.raises(ValueError, match=r"some come twice"):
+        lx.profile(residual, found, "x", values=[0.9, 1.1, 1.1])

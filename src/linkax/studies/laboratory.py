@@ -1,9 +1,12 @@
 """Noise in experiments: how large it is, and how sure it leaves what is fitted."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from linkax.model.numbers import require_type
@@ -11,7 +14,9 @@ from linkax.studies.experiments import Experiment, Experiments, Noise, predict
 from linkax.studies.losses import Loss, influence, spread
 from linkax.studies.sensors import AbstractSensor
 from linkax.studies.uncertainty import Scatter
+from linkax.xla.users_line import warn
 
+TELLING = 0.05  # mean curvature of a robust loss, above which it tells how sure a fit is
 LEAST = 1e-9  # noise relative to the largest measurement, below which it is rounding
 
 
@@ -72,6 +77,8 @@ class Laboratory(NamedTuple):
             raise ValueError(
                 "there are no experiments in the list to fit; give linkax.Experiment(model, record, sensors)"
             )
+        for each in filter(lambda each: callable(each.sensors), found):
+            jax.eval_shape(partial(_check_noise, each), params)
         return Laboratory(found, Experiments.of(found), [each.sensors_at(params) for each in found])
 
     @property
@@ -183,10 +190,29 @@ class Laboratory(NamedTuple):
             rows = errors.of(group)
             if loss != "squares":
                 of_square, first, second = influence(loss, u[rows])
+                if not np.mean(second) > TELLING:
+                    channel = errors.names[group][0]
+                    warn(
+                        f"most residuals of channel {channel!r} are beyond its noise, so that its loss {loss!r} tells "
+                        "nothing of how sure the fit is, and the channel does not count there; give a larger noise, or "
+                        "None, or look whether the model can give these data"
+                    )
+                    factors[rows] = 0.0
+                    continue
                 factors[rows] = np.sqrt(np.mean(second)) / of_square
                 variances[rows] = share**2 * np.mean(first**2) / np.mean(second)
         there = errors.there
         return Worth(factors, Scatter(factor, variances[there]))
+
+
+def _check_noise(experiment, params) -> None:
+    """Raise a ValueError where the noise of a sensor is a parameter."""
+    for name, sensor in experiment.sensors_at(params).items():
+        if isinstance(sensor.noise, Tracer):
+            raise ValueError(
+                f"the noise of channel {name!r} is a parameter, which a fit would make infinite; leave it None, and "
+                "the fit finds it"
+            )
 
 
 def _share(errors, size) -> float:

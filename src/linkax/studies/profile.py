@@ -23,6 +23,7 @@ from linkax.xla.waiting import compiling
 LEVEL = 0.95  # of the interval that a profile is wide enough for
 WIDTH = 2.0  # of the values by default, in half widths of that interval
 UNKNOWN = 1.0  # the same for a parameter without standard error, in free numbers
+ROUNDING = 1e-8  # of a residual
 BETTER = 1e-3  # of the noise squared: by how much less a loss is that of another minimum
 
 
@@ -53,9 +54,11 @@ def profile(
 
     **Returns:** a `Profile`. A refit that fails is marked, and harms no other.
 
-    **Raises:** `ValueError` for a fit without covariance, for a name that is none of its numbers or one of a
-    `PhysicalInertia`, which depends on others, for values that are not finite or out of bounds, and for a function that
-    does not have the residual of the fit.
+    Priors are parts of the likelihood; the residual must then be in units of its noise.
+
+    **Raises:** `ValueError` for a fit without covariance or without noise, for a name that is none of its numbers or
+    one of a `PhysicalInertia`, which depends on others, for values that are not finite, out of bounds or given twice,
+    and for a function that does not have the residual of the fit.
 
     **Warns:** where the profile does not rise to the threshold of 95 % on some side, as where the data do not determine
     the number, and where some refit is better than the fit.
@@ -63,6 +66,8 @@ def profile(
     require_type(function, Callable, "function", "give the residual that was fitted, a function of (params, *args)")
     require_type(found, Fit, "found", "give what linkax.fit returned")
     spread = found.determined()
+    if not spread.noise > 0.0:
+        raise ValueError("the fit is exact, so that its residual tells of no noise; profile one of data with noise")
     require_type(args, list | tuple, "args", "give a tuple of what else the function gets")
     data = as_arrays(tuple(args), "args")
     whole_number(steps, "steps")
@@ -78,7 +83,7 @@ def profile(
     with compiling():
         z, losses, converged = _refitted(function, spread.free, data, fixed, entry, places, starts, steps, tolerance)
         again = _loss(function, spread.free, data, spread.z)
-    _check_same(float(again), found.loss)
+    _check_same(float(again), found.loss, len(found.residual))
     params = jax.tree.map(np.asarray, jax.vmap(spread.free.params)(z))
     numbers = np.asarray(jax.vmap(spread.free.vector)(z)[:, index])
     order = np.argsort(numbers)
@@ -90,7 +95,7 @@ def profile(
         params=jax.tree.map(lambda leaf: leaf[order], params),
         converged=np.asarray(converged)[order],
         loss=found.loss,
-        noise=spread.noise,
+        noise=1.0 if spread.free.num_priors else spread.noise,
         freedom=spread.freedom,
     )
     _warn(result)
@@ -110,7 +115,10 @@ def _place(found, free, name) -> tuple[int, int]:
 def _checked(values) -> Float[np.ndarray, " n"]:
     array = np.asarray(real(values, "values"))
     right = lambda array: is_finite(array) and array.ndim == 1 and array.size > 0
-    return np.asarray(require(array, right, "values", "give a list of finite numbers"))
+    found = np.asarray(require(array, right, "values", "give a list of finite numbers"))
+    if len(np.unique(found)) < len(found):
+        raise ValueError(f"values are {found.tolist()}, of which some come twice; give each once")
+    return found
 
 
 def _default_places(spread, entry, count):
@@ -166,8 +174,8 @@ def _refitted(function, free, args, others, entry, places, starts, steps, tolera
     return jax.vmap(refit)(places, starts)
 
 
-def _check_same(loss, fitted):
-    if not np.isclose(loss, fitted, rtol=1e-6, atol=0.0):
+def _check_same(loss, fitted, count):
+    if not np.isclose(loss, fitted, rtol=1e-6, atol=ROUNDING**2 * count):
         raise ValueError(
             f"function has the loss {one(loss)} at the fitted parameters, and the fit {one(fitted)}; give the residual "
             "and the args that were fitted"

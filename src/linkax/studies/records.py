@@ -15,6 +15,7 @@ from linkax.model.numbers import one_of, positive, real, require_type
 from linkax.tables import Rows, Table, count, numbers, printed_as
 from linkax.xla.arrays import Array
 
+REACH = 10  # of the filter to either side, in samples that are kept
 EVEN = 1e-3  # of the mean time between samples: how far equal ones may differ
 
 
@@ -82,7 +83,8 @@ class Record(eqx.Module):
           count, and an interval without samples gives none. Independent noise falls with the root of their number; a
           motion with acceleration a is off by up to a × spacing² / 24.
         - "filter": a low-pass filter of finite impulse response, without delay, then each k-th sample
-          (`scipy.signal.decimate`). Needs equal times, a whole k, and no missing samples.
+          (`scipy.signal.decimate`). Needs equal times, a whole k, and no missing samples. The first ten and the last
+          ten are left out, which it would mix with what was not recorded.
 
         Channels that are no faster than this stay as they are.
 
@@ -162,7 +164,13 @@ def _filtered(name, ts, values, spacing):
         raise ValueError(f"spacing is {spacing} s, channel {name!r} has samples {mean:.6g} s apart; give a multiple")
     if np.any(np.isnan(values)):
         raise ValueError(f"channel {name!r} has missing samples, which a filter cannot bridge; by='mean'")
-    return ts[::factor], decimate(values, factor, ftype="fir", axis=0, zero_phase=True)
+    found = decimate(values, factor, ftype="fir", axis=0, zero_phase=True)
+    if len(found) <= 2 * REACH:
+        raise ValueError(
+            f"channel {name!r} has {len(found)} samples at that spacing, and the filter needs {REACH} on either side "
+            "of each; by='mean'"
+        )
+    return ts[::factor][REACH:-REACH], found[REACH:-REACH]
 
 
 def read_record(

@@ -51,7 +51,8 @@ class Spread(NamedTuple):
 
     def draws(self, key: Array, count: int) -> Any:
         """Parameters from the normal distribution of the free numbers, with a leading axis of `count`."""
-        scaled = self.of_free / np.outer(self.deviation, self.deviation)
+        size = np.where(self.deviation > 0.0, self.deviation, 1.0)  # zero where the fit is exact
+        scaled = self.of_free / np.outer(size, size)
         values, vectors = np.linalg.eigh(scaled)
         root = self.deviation[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
         normal = jax.random.normal(key, (count, len(self.z)))
