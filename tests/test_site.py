@@ -18,7 +18,9 @@ BY_HAND = {page: re.findall(r"\.\. py:data:: linkax\.(\w+)", text) for page, tex
 DESCRIBED = {page: [*LISTS[page].split(), *BY_HAND[page]] for page in TEXTS}
 
 # Minutes of compiling.
-SLOW = tuple(f"reference/{page}" for page in ("derivatives", "tolerances", "laboratory", "formulations", "beams"))
+SLOW = tuple(
+    f"reference/{page}" for page in ("derivatives", "kinematics", "laboratory", "tolerances", "formulations", "beams")
+)
 mark = lambda page: [pytest.mark.slow] if page in SLOW else []
 
 

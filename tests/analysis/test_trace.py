@@ -86,7 +86,8 @@ def test_transmission_to_a_slide():
         found.transmission_angle("crank_pin", "guide")
 
 
-@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.grad])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.grad])
 def test_derivatives(linkage, mode):
     """Of positions and accelerations by lengths and by the values, in both modes, against those of the closed form."""
     start = linkage[1]  # whose numbers have no part in it
@@ -234,6 +235,7 @@ def test_drives(linkage):
         lx.trace(mechanism, lx.assemble(mechanism, guess=UP), {"D": np.array([2.0])})
 
 
+@pytest.mark.slow
 def test_a_position_starts_a_run(linkage, turn, tmp_path):
     mechanism, _ = linkage
     solution = lx.simulate(mechanism, turn.state(7), t1=0.01, accuracy=lx.DRAFT)

@@ -38,7 +38,7 @@ def top():
     return lx.simulate(mechanism, state, t1=1.0, accuracy=lx.Accuracy(1e-11), saveat=saveat)
 
 
-@pytest.mark.parametrize("name", ["loop", "top"])
+@pytest.mark.parametrize("name", [pytest.param("loop", marks=pytest.mark.slow), "top"])
 def test_order(name, request):
     """Six of coordinates, five of speeds, and quaternions stay such."""
     solution = request.getfixturevalue(name)

@@ -24,6 +24,7 @@ def row():
     return lx.Mechanism(mechanism.bodies, [*mechanism.joints, *again], mechanism.forces), state
 
 
+@pytest.mark.slow
 def test_from_a_singular_configuration_through_others_with_redundant_loops(row):
     mechanism, state = row
     plan = structure_of(mechanism.topology).elimination
