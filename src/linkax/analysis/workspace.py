@@ -1,7 +1,7 @@
 """Where a mechanism can go: all positions of a grid that a branch leads to."""
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -30,7 +30,7 @@ from linkax.xla.tracing import all_concrete, is_first
 from linkax.xla.waiting import Progress, compiling
 
 TOGETHER = 256  # positions that are computed at once
-Grid = Mapping[Any, ArrayLike | tuple[ArrayLike, ArrayLike, ArrayLike]]
+Grid = Mapping[Any, ArrayLike | Sequence[ArrayLike | Sequence[float]]]
 
 
 def _table(found: "Workspace") -> Table:
