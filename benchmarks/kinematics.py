@@ -15,7 +15,7 @@ SPREAD = 0.1  # of the lengths, which leaves all of them crank-rockers
 TURN = np.linspace(0.0, 2.0 * np.pi, ANGLES)
 
 
-def four_bar(lengths) -> lx.Mechanism:
+def four_bar(lengths, constraints=()) -> lx.Mechanism:
     """Build one with the crank on the origin, and the rocker on the x axis."""
     a, b, c, d = lengths
     crank, coupler, rocker = lx.rod("crank", a, 1.0), lx.rod("coupler", b, 1.0), lx.rod("rocker", c, 1.0)
@@ -25,7 +25,7 @@ def four_bar(lengths) -> lx.Mechanism:
         lx.Revolute("C", coupler.at("tip"), rocker.at("tip"), axis="z"),
         lx.Revolute("D", lx.GROUND.at(jnp.stack([d, 0.0 * d, 0.0 * d])), rocker.at("base"), axis="z"),
     ]
-    return lx.Mechanism([crank, coupler, rocker], joints)
+    return lx.Mechanism([crank, coupler, rocker], joints, constraints=constraints)
 
 
 def trace(lengths) -> dict:
@@ -36,12 +36,13 @@ def trace(lengths) -> dict:
     return {"rocker": found.joint("D"), "result": found.result}
 
 
-def closed_form(lengths: np.ndarray) -> np.ndarray:
-    """Angles of the rockers by the law of cosines."""
-    a, b, c, d = (lengths[:, index, None] for index in range(4))
-    x, y = a * np.cos(TURN) - d, a * np.sin(TURN)
+def rocker_angle(lengths, crank):
+    """The rocker's angle on the branch that has it above, by the law of cosines [rad]."""
+    a, b, c, d = lengths
+    x, y = a * jnp.cos(crank) - d, a * jnp.sin(crank)
     square = x**2 + y**2
-    return np.mod(np.arctan2(y, x), 2.0 * np.pi) - np.arccos((c**2 + square - b**2) / (2.0 * c * np.sqrt(square)))
+    inner = jnp.arccos((c**2 + square - b**2) / (2.0 * c * jnp.sqrt(square)))
+    return jnp.mod(jnp.arctan2(y, x), 2.0 * jnp.pi) - inner
 
 
 def main() -> None:
@@ -50,7 +51,7 @@ def main() -> None:
     began = time.perf_counter()
     found = lx.sweep(trace, jnp.asarray(lengths), chunk=CHUNK)
     whole = time.perf_counter() - began
-    error = np.max(np.abs(np.asarray(found.output["rocker"]) - closed_form(lengths)))
+    error = np.max(np.abs(found.output["rocker"] - rocker_angle(lengths.T[:, :, None], TURN)))
     print(
         json.dumps(
             {

@@ -46,18 +46,7 @@ START = {name: lx.Positive(1.1 * TRUTH[name]) for name in ("coupler_mass", "damp
 
 def motion(params):
     """A driven crank of known mass, a coupler, and a rocker on a spring; friction in the crank's bearing."""
-    crank = lx.rod("crank", length=0.3, mass=1.0)
-    coupler = lx.rod("coupler", length=0.8, mass=params["coupler_mass"])
-    rocker = lx.rod("rocker", length=0.6, mass=1.2)
-    joints = [
-        lx.Revolute("bearing", lx.GROUND, crank.at("base"), axis="z"),
-        lx.Revolute("crank_pin", crank.at("tip"), coupler.at("base"), axis="z"),
-        lx.Revolute("pivot", lx.GROUND.at([0.9, 0.0, 0.0]), rocker.at("base"), axis="z"),
-        lx.Revolute("rocker_pin", coupler.at("tip"), rocker.at("tip"), axis="z", cut=True),
-    ]
-    spring = lx.JointSpring("pivot", params["stiffness"], free=2.4)
-    torques = [lx.JointDamper("bearing", params["damping"]), lx.JointTorque("bearing", 0.5), spring]
-    mechanism = lx.Mechanism([crank, coupler, rocker], joints, [lx.Gravity([0.0, -9.81, 0.0]), *torques])
+    mechanism = _linkage(params, is_loop=True)
     state = lx.assemble(mechanism, {"bearing": params["angle"]}, guess={"crank_pin": -1.0, "pivot": 2.0})
     saveat = diffrax.SaveAt(ts=np.linspace(0.0, 3.0, 121))
     return lx.simulate(mechanism, state, t1=3.0, accuracy=lx.Accuracy(1e-7), saveat=saveat)

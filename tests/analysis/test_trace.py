@@ -7,31 +7,10 @@ import numpy as np
 import pytest
 
 import linkax as lx
+from benchmarks.kinematics import LENGTHS, four_bar, rocker_angle
 
-LENGTHS = np.array([0.4, 1.0, 0.8, 1.0])  # crank, coupler, rocker, ground: a crank-rocker
 UP = {"D": 1.5}
 TURN = np.linspace(0.0, 2.0 * np.pi, 101)
-
-
-def four_bar(lengths, constraints=()):
-    a, b, c, d = lengths
-    crank, coupler, rocker = lx.rod("crank", a, 1.0), lx.rod("coupler", b, 1.0), lx.rod("rocker", c, 1.0)
-    joints = [
-        lx.Revolute("A", lx.GROUND, crank.at("base"), axis="z"),
-        lx.Revolute("B", crank.at("tip"), coupler.at("base"), axis="z"),
-        lx.Revolute("C", coupler.at("tip"), rocker.at("tip"), axis="z"),
-        lx.Revolute("D", lx.GROUND.at(jnp.stack([d, 0.0 * d, 0.0 * d])), rocker.at("base"), axis="z"),
-    ]
-    return lx.Mechanism([crank, coupler, rocker], joints, constraints=constraints)
-
-
-def rocker_angle(lengths, crank):
-    """Of the branch with the rocker above, by the law of cosines."""
-    a, b, c, d = lengths
-    x, y = a * jnp.cos(crank) - d, a * jnp.sin(crank)
-    square = x**2 + y**2
-    inner = jnp.arccos((c**2 + square - b**2) / (2.0 * c * jnp.sqrt(square)))
-    return jnp.mod(jnp.arctan2(y, x), 2.0 * jnp.pi) - inner
 
 
 @pytest.fixture(scope="module")

@@ -117,9 +117,10 @@ class Piece(NamedTuple):
 class Way(eqx.Module):
     """Closed loops at time t with coordinates of some joints, `held`, at values that change with s.
 
+    Where nothing is held, s is the arc length of q [rad, lengths of the mechanism].
+
     - `followed`: drives that move one of these joints, and which of the values: (constraint, value). They hold it there
       instead of where they would at time t.
-      Where nothing is held, s is the arc length of q [rad, lengths of the mechanism].
     """
 
     system: System

@@ -102,11 +102,10 @@ def own_values(near: JointValues, configuration: Configuration) -> Float[Array, 
         if alike.kind.has_quaternion and alike.index is None:
             turned = jnp.sum(values[:, :4] * ends[:, :4], axis=1, keepdims=True) < 0.0
             values = jnp.concatenate([jnp.where(turned, -values[:, :4], values[:, :4]), values[:, 4:]], axis=1)
-        elif not alike.in_tree:
-            turns = jnp.round((ends - values) / (2.0 * jnp.pi))
-            values = values + jnp.where(np.array(alike.units) == "rad", 2.0 * jnp.pi * turns, 0.0)
         found.append(values)
-    return JointValues(near.groups, tuple(found)).flat()
+    values = JointValues(near.groups, tuple(found)).flat()
+    turns = jnp.round((near.flat() - values) / (2.0 * jnp.pi))
+    return jnp.where(wraps(near), values + 2.0 * jnp.pi * turns, values)
 
 
 def followed_drives(held: JointValues, constraints: Sequence[AbstractConstraint]) -> tuple[tuple[int, int], ...]:

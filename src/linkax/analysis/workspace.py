@@ -111,8 +111,8 @@ def workspace(
             apart = values - own
             apart = np.where(wraps(held), np.remainder(apart + np.pi, 2.0 * np.pi) - np.pi, apart)
             first = int(np.argmin(np.sum((apart / _spacing(values)) ** 2, axis=1)))
-            search = _Search(way, values, start.q, came)
-            search.step([(None, first)], values[first] - apart[first])
+            search = _Search(way, np.concatenate([values, (values - apart)[first, None]]), start.q, came)
+            search.step([(len(values), first)])
         if not search.found[first]:
             raise TraceError(
                 "the branch does not lead from the start to the nearest position of the grid, "
@@ -126,14 +126,14 @@ def workspace(
             waiting = [pair for pair in waiting if pair not in tried and not search.found[pair[1]]]
             waiting += [(place, beside) for place in new for beside in _beside(place, shape)]
             line.tell("searching", int(np.sum(search.found)))
-    found = search.found
+    found = search.found[:-1]
     mark = lambda array: np.where(found.reshape(-1, *(1,) * (array.ndim - 1)), array, np.inf)
     return Workspace(
         run=Run.of_state(mechanism, start, t, DEFAULT_FORMULATION, BALANCED),
         ts=mark(np.arange(float(len(values)))),
-        q=mark(search.q),
+        q=mark(search.q[:-1]),
         v=np.full((len(values), len(start.v)), np.nan),
-        distance=mark(search.distances()),
+        distance=mark(search.distances()[:-1]),
         axes=axes,
         reached=found.reshape(shape),
     )
@@ -142,25 +142,20 @@ def workspace(
 class _Search:
     """Which positions are found, where the joints are there, and how the ways came there.
 
-    `way`: the mechanism, what is held, and time; `values`: of all positions, (N, k).
+    `way`: the mechanism, what is held, and time; `values`: of all positions, (N + 1, k). The last one is the start.
     """
 
     def __init__(self, way: tuple[Any, ...], values: Float[np.ndarray, "n k"], q: Any, came: Before) -> None:
-        self.way, self.values, self.start, count = way, values, (np.asarray(q), *map(np.asarray, came)), len(values)
-        self.found = np.zeros(count, bool)
-        self.q, *self.came = (np.repeat(array[None], count, axis=0) for array in self.start)
+        self.way, self.values = way, values
+        self.found = np.arange(len(values)) == len(values) - 1
+        self.q, *self.came = (np.repeat(np.asarray(array)[None], len(values), axis=0) for array in (q, *came))
 
-    def step(self, pairs: list[tuple[int | None, int]], own: Float[np.ndarray, " k"] | None = None) -> list[int]:
-        """Go from positions to those beside them, or from the start with its `own` values; return those found."""
+    def step(self, pairs: list[tuple[int, int]]) -> list[int]:
+        """Go from positions to those beside them, and return those found."""
         if not pairs:
             return []
-        ends = np.array([end for _, end in pairs])
-        if own is None:
-            begins = np.array([begin for begin, _ in pairs])
-            given = self.q[begins], self.values[begins], self.values[ends], *(array[begins] for array in self.came)
-        else:
-            q, *came = (array[None] for array in self.start)
-            given = q, own[None], self.values[ends], *came
+        begins, ends = np.array(pairs).T
+        given = self.q[begins], self.values[begins], self.values[ends], *(array[begins] for array in self.came)
         q, *came, reached = _together(lambda *rows: _step(*self.way, *rows), *given)
         new = ends[reached]
         self.found[new] = True
