@@ -63,7 +63,7 @@ READINGS = {
 }
 
 
-@pytest.mark.parametrize("name", READINGS)
+@pytest.mark.parametrize("name", [pytest.param("reactions", marks=pytest.mark.slow), "states"])
 def test_readings(large, name):
     assert not batched_calls(READINGS[name], times(*large, 41))
 

@@ -247,6 +247,7 @@ def test_a_notebook_shows_the_animation_that_is_written(crank_slider, tmp_path):
         lx.plot.animate(at_end)
 
 
+@pytest.mark.slow
 def test_reactions_that_are_not_unique_are_hatched(crank_slider):
     solution, _ = crank_slider
     assert not lx.plot.reaction(solution, "guide").axes[0].collections
@@ -297,6 +298,7 @@ def test_titles_of_motions_tell_the_point(at, name, title, crank_slider):
     assert lx.plot.motion(crank_slider[0], "slider", at, name).axes[0].get_title() == title
 
 
+@pytest.mark.slow
 def test_the_reaction_of_a_drive_is_its_torque_or_force():
     arm, load = lx.rod("arm", 1.0, 2.0), lx.point_mass("load", 3.0)
     joints = [lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z"), lx.Prismatic("lift", lx.GROUND, load, "y")]

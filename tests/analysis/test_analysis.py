@@ -71,6 +71,7 @@ def test_a_pendulum_comes_to_rest_and_vibrates():
         lx.linearise(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)))
 
 
+@pytest.mark.slow
 def test_frequency_on_the_tangent_space_of_a_redundant_loop():
     """The parallelogram hangs down and swings with a'' = -1.2 g cos a."""
     mechanism, state = start("spatial-four-link", "FL3", {"angle": -1.2, "speed": 0.0})

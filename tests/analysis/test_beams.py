@@ -66,6 +66,7 @@ def test_elastica(load):
     np.testing.assert_allclose(tip(cantilever((0.0, load, 0.0)))[:2], exact, atol=3e-7)
 
 
+@pytest.mark.slow
 def test_rolled_up_by_a_moment():
     found = at_rest(cantilever(moment=2.0 * np.pi))
     np.testing.assert_allclose(found.position("beam", at="tip")[0], 0.0, atol=1e-9)

@@ -33,6 +33,7 @@ def hoop(rate, radius=0.5, law=_turned):
     return lx.Mechanism([ring, bead], joints, [WEIGHT], [turning("shaft", rate, law)])
 
 
+@pytest.mark.slow
 def test_bead_on_a_rotating_hoop():
     """Its bottom is unstable where ω² > g / R; cos θ = g / (ω² R) is stable, of frequency ω sin θ."""
     rate, mechanism = 8.0, hoop(8.0)

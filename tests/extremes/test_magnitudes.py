@@ -128,6 +128,7 @@ def test_digits_lost_to_many_bodies_are_told():
     assert dataclasses.replace(found, definiteness=jnp.asarray(1e-5)).remark() == lx.REMARKS.none
 
 
+@pytest.mark.slow
 def test_beams_lose_no_inertia_to_their_nodes():
     """These have none, and beams bend away from them: what stops a run is not that."""
     beam = lx.Beam("beam", 2.0, lx.rectangle(0.1, 0.1, lx.Material(2.1e11, 0.3, 7850.0)))

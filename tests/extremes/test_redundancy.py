@@ -76,6 +76,7 @@ def test_a_rod_too_long_does_not_fit(excess):
         run(parallelogram(excess), {"a": SPEED})
 
 
+@pytest.mark.slow
 def test_pivots_in_one_point():
     """A coupler of no length is free to turn, whatever the rods do."""
     mechanism = parallelogram(place=0.0, width=0.0)

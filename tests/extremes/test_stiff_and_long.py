@@ -33,6 +33,7 @@ def pendulum(times):
     return solve_ivp(rates, (0.0, times[-1]), (1.0, 0.0), method="DOP853", rtol=1e-13, atol=1e-13, t_eval=times).y[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stiffness", "duration"), [(1e4, 1.0), (1e6, 1.0), (1e8, 0.2), (1e10, 0.1), (1e12, 0.05)])
 def test_a_stiff_spring_is_a_rod(stiffness, duration):
     """Up to its stretch, 2e1 N / stiffness, and to what rounding of its length does: stiffness × 1e-16 m of force."""

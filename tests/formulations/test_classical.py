@@ -47,7 +47,7 @@ def _known(scene):
     return *start(scene), known["t"], np.arctan2(known["y"], known["x"]), rate
 
 
-@pytest.mark.parametrize("scene", COUNTS)
+@pytest.mark.parametrize("scene", [pytest.param("crank-slider", marks=pytest.mark.slow), "pendulum"])
 @pytest.mark.parametrize("name", NAMES)
 def test_order(name, scene):
     """That of the paper's formulation: tests/simulation/test_orders.py."""

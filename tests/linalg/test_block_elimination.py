@@ -98,7 +98,7 @@ def assert_solved(given, inverse, metric, at_once):
     np.testing.assert_allclose(weight @ a, given.force + given.jacobian.T @ multipliers, atol=atol)
 
 
-@pytest.mark.parametrize("metric", ["mass", "identity"])
+@pytest.mark.parametrize("metric", ["mass", pytest.param("identity", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ROWS)
 def test_cell_by_cell_as_at_once(name, metric):
     given = system(name)
@@ -172,6 +172,7 @@ def test_refinement_with_factors_of_a_system_nearby(name):
     np.testing.assert_allclose(found, at_once.apply(changed.force, changed.rate)[0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_and_batches():
     given = system("redundant")
 

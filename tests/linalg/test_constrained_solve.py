@@ -201,7 +201,7 @@ def central(values):
     return np.stack([values[1] - values[2], values[3] - values[4]], axis=-1) / (2 * STEP)
 
 
-@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("metric", ["mass", pytest.param("identity", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", RANKS)
 def test_derivatives_to_second_order_in_all_modes(case, metric):
     chosen = problem(case)
@@ -218,6 +218,7 @@ def test_derivatives_to_second_order_in_all_modes(case, metric):
     np.testing.assert_allclose(batch["reverse"], batch["forward"], atol=1e-12 * np.max(np.abs(first)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", METRICS)
 def test_a_batch_of_derivatives_equals_its_members(metric):
     """Redundant and zero rows in one batch, each with a rank of its own."""

@@ -59,6 +59,7 @@ def test_what_is_known_is_forgotten_with_the_array():
     assert not known._remembered
 
 
+@pytest.mark.slow
 def test_a_zero_that_a_user_replaces_is_none():
     """The end of a pendulum that hangs from a point aside, by a mechanism changed after it was made."""
 

@@ -38,6 +38,7 @@ class Numbers:
         return lambda leaf: self.state([*self.leaves[:index], leaf, *self.leaves[index + 1 :]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenes("pendulum"))
 def test_every_leaf_alone_has_a_derivative_in_both_modes(name):
     """Each is traced alone, as JAX tells rules which inputs do not change."""

@@ -66,6 +66,7 @@ def test_rods_that_are_drawn_apart(off):
         assert re.search(r"'rocker_pin' joins points that are drawn 0\.05 m apart, .*draw them", str(told[0].message))
 
 
+@pytest.mark.slow
 def test_a_spin_that_nothing_decides():
     """Of a coupler between two balls: asked for, it is as asked."""
     mechanism = coupler_between_balls()

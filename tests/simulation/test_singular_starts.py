@@ -173,6 +173,7 @@ def test_in_a_batch_a_start_without_branch_harms_no_other():
         found.passages()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "asked",
     [{"base_x": -5.0}, {"base_x": -5.0, "base_y": -5.0}, pytest.param({"base_y": 3.0}, marks=pytest.mark.slow)],

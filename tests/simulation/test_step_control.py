@@ -168,6 +168,7 @@ def test_implicit_steps_go_on_while_they_converge(rtol):
     assert stats["num_rejected_steps"] < stats["num_accepted_steps"] / 4
 
 
+@pytest.mark.slow
 def test_derivatives_over_steps_whose_equations_have_no_solution():
     """The first step, of the whole time, and some after it fail, and are tried again, shorter."""
     scene = SCENES["crank-slider"]

@@ -195,6 +195,7 @@ def test_one_argument_of_a_type():
     assert_same(jax.jit(straight_line(function))(*given), function(*given))
 
 
+@pytest.mark.slow
 def test_as_many_entries_and_lanes_as_one_kernel_has():
     """XLA must make a kernel of the loop around a fusion, however large."""
     function = lambda x: jnp.sin(x) + jnp.roll(x, 1)
@@ -274,6 +275,7 @@ def test_large_arrays_of_few_scalars():
     np.testing.assert_allclose(jax.vmap(straight_line(sparse))(x), jax.vmap(sparse)(x), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_straight_lines_over_lanes_within_others():
     """They stay of their own, know what is the same in all lanes, and what they know of results is known after."""
     inner = straight_line(lambda x, y: (x * y[0] + y[1], jnp.stack([y[1], 2.0 * y[1]])))

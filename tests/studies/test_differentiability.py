@@ -30,6 +30,7 @@ def parallelogram(params):
     return lx.simulate(mechanism, lx.assemble(mechanism, {"pivot_0": 1.0}, guess=guess), t1=0.2)
 
 
+@pytest.mark.slow
 def test_equal_lengths_of_a_crank_slider_change_together_alone():
     found = lx.differentiability(crank_slider, NUMBERS)
     assert set(found.reasons) == {"crank", "rod"}
