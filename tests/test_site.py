@@ -19,7 +19,8 @@ DESCRIBED = {page: [*LISTS[page].split(), *BY_HAND[page]] for page in TEXTS}
 
 # Minutes of compiling.
 SLOW = tuple(
-    f"reference/{page}" for page in ("derivatives", "kinematics", "laboratory", "tolerances", "formulations", "beams")
+    f"reference/{page}"
+    for page in ("derivatives", "kinematics", "synthesis", "laboratory", "tolerances", "formulations", "beams")
 )
 mark = lambda page: [pytest.mark.slow] if page in SLOW else []
 

@@ -74,6 +74,7 @@ from linkax.model.joints.revolute import Revolute as Revolute  # noqa: E402
 from linkax.model.joints.screw import Screw as Screw  # noqa: E402
 from linkax.model.joints.spherical import Spherical as Spherical  # noqa: E402
 from linkax.model.joints.universal import Universal as Universal  # noqa: E402
+from linkax.model.linkages import linkage as linkage  # noqa: E402
 from linkax.model.mechanism import Mechanism as Mechanism  # noqa: E402
 from linkax.model.point_forces import Damper as Damper  # noqa: E402
 from linkax.model.point_forces import PointForce as PointForce  # noqa: E402
@@ -144,6 +145,9 @@ from linkax.studies.shooting import Shots as Shots  # noqa: E402
 from linkax.studies.shooting import shoot as shoot  # noqa: E402
 from linkax.studies.sweep import sweep as sweep  # noqa: E402
 from linkax.studies.sweep_result import Sweep as Sweep  # noqa: E402
+from linkax.studies.synthesis import synthesis as synthesis  # noqa: E402
+from linkax.studies.synthesis_result import Candidate as Candidate  # noqa: E402
+from linkax.studies.synthesis_result import Synthesis as Synthesis  # noqa: E402
 from linkax.studies.tolerance_analysis import tolerance_analysis as tolerance_analysis  # noqa: E402
 from linkax.studies.tolerance_result import SobolIndices as SobolIndices  # noqa: E402
 from linkax.studies.tolerance_result import Statistics as Statistics  # noqa: E402

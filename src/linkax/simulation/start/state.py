@@ -5,8 +5,11 @@ from itertools import groupby
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Float
 
+from linkax.equations.coordinates import neutral
+from linkax.model.mechanism import Mechanism
 from linkax.model.topology import Topology
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
@@ -38,6 +41,15 @@ class State(eqx.Module):
     q: Float[Array, "*batch n_q"]
     v: Float[Array, "*batch n_v"]
     topology: Topology | None = eqx.field(static=True, default=None, repr=False)
+
+    @staticmethod
+    def as_drawn(mechanism: Mechanism) -> "State":
+        """All joints in the tree at zero, and at rest: the state in which a mechanism of `placed` bodies is drawn.
+
+        Nothing is solved for, so it is on the closed loops only where these are drawn closed.
+        """
+        topology = mechanism.topology
+        return State(jnp.asarray(neutral(topology, float)), jnp.zeros(topology.num_speeds), topology)
 
 
 def joint_rows(topology: Topology, *columns: tuple[Any, bool]) -> list[list[str]]:
