@@ -83,6 +83,53 @@ def test_noise_that_is_known_but_for_a_factor_gives_the_same(known):
     np.testing.assert_allclose(given.noise, found.noises["encoder"] / 0.02, rtol=1e-4)
 
 
+def two_encoders(params):
+    own = {"gain": params["gain"], "bias": params["own bias"]}
+    return {"few": lx.Encoder("hinge", **own), "many": lx.Encoder("hinge", bias=params["bias"])}
+
+
+def two_records(motion, seed, few):
+    draw, exact = np.random.default_rng(seed), np.asarray(motion.at(TIMES).joint("hinge"))
+    chosen = np.linspace(0, len(TIMES) - 1, few).astype(int)
+    noise = 0.05 * draw.normal(size=few), NOISE * draw.normal(size=len(TIMES))
+    return {"few": (TIMES[chosen], exact[chosen] + noise[0]), "many": (TIMES, exact + noise[1])}
+
+
+OWN = {"gain": 1.0, "own bias": 0.0, "bias": 0.0}
+
+
+def test_noise_of_a_channel_with_parameters_of_its_own(known, motion):
+    """As of linear regression, to each channel what it determines."""
+    record = two_records(motion, 0, 4)
+    found = lx.fit(lx.Experiment(known, record, two_encoders), OWN)
+    told = found.predict()[0]
+    for name, freedom in (("few", 4 - 2), ("many", len(TIMES) - 1)):
+        left = np.sum((told[name] - record[name][1]) ** 2)
+        np.testing.assert_allclose(found.noises[name], np.sqrt(left / freedom), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_noise_is_right_in_the_mean_of_many_records(known, motion):
+    fits = [lx.fit(lx.Experiment(known, two_records(motion, seed, 4), two_encoders), OWN) for seed in range(80)]
+    np.testing.assert_allclose(np.mean([fit.noises["few"] ** 2 for fit in fits]), 0.05**2, rtol=0.25)
+
+
+def test_noise_beside_priors_and_what_is_not_determined(known, motion):
+    """What a prior holds takes nothing from the noise, and neither does a number without influence."""
+    record = two_records(motion, 0, 4)
+    held = {"gain": lx.Normal(1.0, 1e-4), "own bias": lx.Normal(0.0, 1e-4), "bias": 0.0, "idle": 1.0}
+    with pytest.warns(UserWarning, match="do not determine 'idle'"):
+        found = lx.fit(lx.Experiment(known, record, two_encoders), held)
+    left = np.sum((found.predict()[0]["few"] - record["few"][1]) ** 2)
+    np.testing.assert_allclose(found.noises["few"], np.sqrt(left / 4), rtol=1e-4)
+
+
+def test_steps_bound_those_of_all_noise(known, motion):
+    experiment = lx.Experiment(known, two_records(motion, 0, 4), two_encoders)
+    found = lx.fit(experiment, OWN, steps=2)
+    assert (found.steps, found.ended) == (2, "out of steps")
+
+
 @pytest.mark.parametrize(
     "loss", ["squares", *(pytest.param(loss, marks=pytest.mark.slow) for loss in ("huber", "cauchy"))]
 )

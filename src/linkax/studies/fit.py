@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 
 from linkax.model.numbers import number, require, require_type, whole_number
-from linkax.studies.experiments import Experiment, Noise
+from linkax.studies.experiments import Experiment
 from linkax.studies.fit_result import Fit, Starts
 from linkax.studies.fit_search import (
     AbstractSearch,
@@ -78,7 +78,8 @@ def fit(
     - `optimiser`: for a residual, a least-squares solver of optimistix, by default Levenberg and Marquardt's method
       with damping relative to the sensitivities; for a residual or a loss, one of optax, for a loss by default
       `optax.adam`.
-    - `steps`: largest number of steps; by default 100 for a residual, 1000 for a loss.
+    - `steps`: largest number of steps; by default 100 for a residual, 1000 for a loss; of all searches together, where
+      the noise of sensors is found, which takes several.
     - `tolerance`: relative change of parameters and residual at which Levenberg-Marquardt ends; relative gain of the
       loss from which a step of optax counts as a gain.
     - `patience`: number of steps without gain after which the fit ends; by default unlimited.
@@ -94,7 +95,8 @@ def fit(
     **Raises:** `ValueError` for parameters that are not numbers; for a function that returns none, or that is not
     finite or has no derivative where the fit starts; and for a checkpoint of another fit.
 
-    **Warns:** of parameters that the data do not determine, and where the fit ended at an edge or without derivative.
+    **Warns:** of parameters that the data do not determine, where the fit ended at an edge or without derivative, and
+    of noise of sensors that does not settle.
     """
     kinds = Callable | Experiment | list | tuple
     require_type(
@@ -115,12 +117,8 @@ def fit(
         z, others = _best_start(search, free.starts(starts), data, steps, progress)
     z, losses, ended = run_search(search, data, steps, tolerance, patience, checkpoint, progress, z)
     if laboratory is not None and laboratory.finds_noise:
-        for _ in range(ROUNDS):
-            (before,), data = data, (laboratory.noise(laboratory.errors(free.params(z)), len(z)),)
-            if _is_settled(before, data[0]):
-                break
-            z, more, ended = run_search(search, data, steps, tolerance, patience, None, progress, z)
-            losses += more
+        again = lambda data, z, left: run_search(search, data, left, tolerance, patience, None, progress, z)
+        z, data, ended = _settled(again, search, laboratory, z, data, steps, losses, ended)
     if is_loss:
         result = _without_covariance(search, z, min(losses), None, losses, ended)
     else:
@@ -144,8 +142,34 @@ def _laboratory(experiments, free, args, checkpoint) -> tuple[Laboratory, Callab
     return laboratory, laboratory.together, (laboratory.noise(errors),)
 
 
-def _is_settled(before: Noise, now: Noise) -> bool:
-    return all(np.all(np.abs(now[name] / before[name] - 1.0) <= SETTLED) for name in now)
+def _settled(again, search, laboratory, z, data, steps, losses, ended):
+    """Find the noise by what a fit leaves, and fit again, in turn, until the noise stays as it is.
+
+    **Arguments:** `again`: (data, z, steps left) -> what `run_search` returns; `losses`: so far, to which more come.
+
+    **Warns:** where it does not.
+    """
+    for count in range(ROUNDS + 1):
+        errors, (before,) = laboratory.errors(search.free.params(z)), data
+        slopes = np.asarray(sensitivity(search, z, data)[1])
+        if not np.all(np.isfinite(slopes)):
+            break
+        data = (laboratory.noise(errors, laboratory.lost(errors, before, slopes)),)
+        changes = {name: np.max(np.abs(now / before[name] - 1.0)) for name, now in data[0].items()}
+        name = max(changes, key=lambda name: changes[name])
+        left = steps - len(losses)  # each search evaluates its start, too
+        if changes[name] <= SETTLED or left < 0:
+            ended = ended if changes[name] <= SETTLED else "out of steps"
+            break
+        if count == ROUNDS:
+            warn(
+                f"the noise of channel {name!r} still changes by {changes[name]:.1%} after {ROUNDS} fits in turn with "
+                "it; give a noise to its sensor"
+            )
+            break
+        z, more, ended = again(data, z, left)
+        losses += more
+    return z, data, ended
 
 
 def _best_start(search, starts, data, steps, progress):
@@ -196,7 +220,7 @@ def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> F
     there, factors = np.ones(len(residual), bool), np.ones(len(residual))
     if laboratory is not None:
         errors = laboratory.errors(search.free.params(z))
-        worth = laboratory.worth(errors, args[0], len(z))
+        worth = laboratory.worth(errors, args[0], slopes)
         there[:count], factors[:count], scatter = errors.there, worth.factors, worth.scatter
     count = int(np.sum(there[:count]))
     residual, slopes = residual[there], (factors[:, None] * slopes)[there]

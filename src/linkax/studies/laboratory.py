@@ -13,7 +13,7 @@ from linkax.model.numbers import require_type
 from linkax.studies.experiments import Experiment, Experiments, Noise, predict
 from linkax.studies.losses import Loss, influence, spread
 from linkax.studies.sensors import AbstractSensor
-from linkax.studies.uncertainty import Scatter
+from linkax.studies.uncertainty import Scatter, leverages
 from linkax.xla.users_line import warn
 
 TELLING = 0.05  # mean curvature of a robust loss, above which it tells how sure a fit is
@@ -144,20 +144,28 @@ class Laboratory(NamedTuple):
             return f"{which} cannot be predicted where the fit starts: {error}"
         return f"{which} is not predicted to be finite where the fit starts; look at the solution of its model"
 
-    def noise(self, errors: Errors, size: int = 0) -> Noise:
-        """Estimate the noise of sensors that give none, by channel, where `size` numbers have been fitted to it."""
+    def noise(self, errors: Errors, lost: Float[np.ndarray, " n"] | None = None) -> Noise:
+        """Estimate the noise of sensors that give none, by channel.
+
+        Of squares, in turn with a fit, this is restricted maximum likelihood (Patterson and Thompson, Recovery of
+        inter-block information when block sizes are unequal, 1971).
+
+        **Arguments:** `lost`: of each row, the part of a measurement that parameters were fitted to; see `lost`.
+        """
         found, largest = {}, self._rows(lambda i, name: np.abs(self.experiments[i].record[name].values))
+        lost = np.zeros_like(errors.values) if lost is None else lost
         for name, sensor in self.by_channel.items():
             if sensor.noise is not None:
                 continue
-            groups = [group for group, (channel, _) in enumerate(errors.names) if channel == name]
             each = [
                 max(
-                    _share(errors, size) * spread(sensor.loss, errors.values[errors.of(group)]),
-                    LEAST * np.max(largest[errors.of(group)]),
+                    _share(lost[rows]) * spread(sensor.loss, errors.values[rows]),
+                    LEAST * np.max(largest[rows]),
                     np.finfo(float).tiny,
                 )
-                for group in groups
+                for group, (channel, _) in enumerate(errors.names)
+                if channel == name
+                for rows in [errors.of(group)]
             ]
             shape = next(
                 np.shape(each.record[name].values)[1:] for each in self.experiments if name in each.record.channels
@@ -165,44 +173,86 @@ class Laboratory(NamedTuple):
             found[name] = np.reshape(each, shape)
         return found
 
-    def worth(self, errors: Errors, noise: Noise, size: int) -> Worth:
-        """What the rows of the residual are worth.
+    def lost(self, errors: Errors, noise: Noise, slopes: Float[np.ndarray, "m p"]) -> Float[np.ndarray, " n"]:
+        """Of each row, the part of a measurement that parameters were fitted to, and that tells of no noise.
 
-        The estimate is an M-estimate: with ψ the derivative of the loss by u, the residual in units of the noise, and j
-        that of u by the parameters, its covariance is A⁻¹ B A⁻¹ with A = Σ E[ψ′] jᵀj and B = Σ E[ψ²] jᵀj (Huber, Robust
-        Statistics, 1981, chapter 7). Expectations are means over each component of a channel; over all channels for
-        squares, whose noise may be known but for a factor.
+        These are the leverages of the rows, with which priors and all channels compete for the parameters.
+
+        **Arguments:** `slopes`: of the residual in units of `noise`, and of priors.
         """
+        found = self._influences(errors, noise)
+        return leverages(_weighed(found.factors, slopes))[: len(errors.values)]
+
+    def _influences(self, errors, noise) -> "_Influences":
+        """What the losses make of the rows."""
         deviations = self._rows(
             lambda i, name: np.broadcast_to(
                 noise[name] if self.sensors[i][name].noise is None else self.sensors[i][name].noise,
                 np.shape(self.experiments[i].record[name].values),
             )
         )
-        u, share = errors.values / deviations, _share(errors, size)
-        losses: list[Loss] = [self.by_channel[name].loss for name, _ in errors.names]
-        squares = errors.there & np.isin(
-            errors.groups, [group for group, loss in enumerate(losses) if loss == "squares"]
-        )
-        factor = share * (spread("squares", u[squares]) if np.any(squares) else spread("huber", u[errors.there]))
-        factors, variances = np.ones_like(u), np.full_like(u, factor**2)
-        for group, loss in enumerate(losses):
+        u, factors, silent = errors.values / deviations, np.ones_like(errors.values), []
+        ratios = np.ones_like(u)
+        for group, loss in self._robust(errors).items():
             rows = errors.of(group)
-            if loss != "squares":
-                of_square, first, second = influence(loss, u[rows])
-                if not np.mean(second) > TELLING:
-                    channel = errors.names[group][0]
-                    warn(
-                        f"most residuals of channel {channel!r} are beyond its noise, so that its loss {loss!r} tells "
-                        "nothing of how sure the fit is, and the channel does not count there; give a larger noise, or "
-                        "None, or look whether the model can give these data"
-                    )
-                    factors[rows] = 0.0
-                    continue
+            of_square, first, second = influence(loss, u[rows])
+            if np.mean(second) > TELLING:
                 factors[rows] = np.sqrt(np.mean(second)) / of_square
-                variances[rows] = share**2 * np.mean(first**2) / np.mean(second)
-        there = errors.there
-        return Worth(factors, Scatter(factor, variances[there]))
+                ratios[rows] = np.mean(first**2) / np.mean(second)
+            else:
+                factors[rows] = 0.0
+                silent.append(group)
+        return _Influences(u, factors, ratios, silent)
+
+    def _robust(self, errors) -> dict[int, Loss]:
+        """Groups whose loss is not that of squares, and theirs."""
+        losses: dict[int, Loss] = {group: self.by_channel[name].loss for group, (name, _) in enumerate(errors.names)}
+        return {group: loss for group, loss in losses.items() if loss != "squares"}
+
+    def worth(self, errors: Errors, noise: Noise, slopes: Float[np.ndarray, "m p"]) -> Worth:
+        """What the rows of the residual are worth.
+
+        The estimate is an M-estimate: with ψ the derivative of the loss by u, the residual in units of the noise, and j
+        that of u by the parameters, its covariance is A⁻¹ B A⁻¹ with A = Σ E[ψ′] jᵀj and B = Σ E[ψ²] jᵀj (Huber, Robust
+        Statistics, 1981, chapter 7). Expectations are means over each component of a channel; over all channels for
+        squares, whose noise may be known but for a factor.
+
+        **Arguments:** `slopes`: as in `lost`.
+        """
+        u, factors, ratios, silent = self._influences(errors, noise)
+        lost, robust = leverages(_weighed(factors, slopes))[: len(u)], self._robust(errors)
+        for group in silent:
+            warn(
+                f"most residuals of channel {errors.names[group][0]!r} are beyond its noise, so that its loss "
+                f"{robust[group]!r} tells nothing of how sure the fit is, and the channel does not count there; give a "
+                "larger noise, or None, or look whether the model can give these data"
+            )
+        squares = errors.there & ~np.isin(errors.groups, list(robust))
+        counted, loss = (squares, "squares") if np.any(squares) else (errors.there, "huber")
+        factor = _share(lost[counted]) * spread(loss, u[counted])
+        variances = np.full_like(u, factor**2)
+        for group in robust:
+            rows = errors.of(group)
+            variances[rows] = _share(lost[rows]) ** 2 * ratios[rows]
+        return Worth(factors, Scatter(factor, variances[errors.there]))
+
+
+class _Influences(NamedTuple):
+    """What losses make of rows.
+
+    - `u`: residuals in units of the noise, (n,). `factors`: see `Worth`.
+    - `ratios`: E[ψ²] / E[ψ′], see `Laboratory.worth`. `silent`: groups beyond whose noise most residuals are.
+    """
+
+    u: Float[np.ndarray, " n"]
+    factors: Float[np.ndarray, " n"]
+    ratios: Float[np.ndarray, " n"]
+    silent: list[int]
+
+
+def _weighed(factors, slopes):
+    """Slopes of all rows, and of priors, with the factors of the losses."""
+    return np.concatenate([factors[:, None] * slopes[: len(factors)], slopes[len(factors) :]])
 
 
 def _check_noise(experiment, params) -> None:
@@ -215,7 +265,6 @@ def _check_noise(experiment, params) -> None:
             )
 
 
-def _share(errors, size) -> float:
-    """By how much noise is larger than what a fit of `size` numbers leaves of it."""
-    count = int(np.sum(errors.there))
-    return float(np.sqrt(count / max(count - size, 1)))
+def _share(lost) -> float:
+    """By how much noise is larger than what a fit leaves of it; of the rows of a group."""
+    return float(np.sqrt(len(lost) / max(len(lost) - np.sum(lost), 1.0)))

@@ -82,6 +82,45 @@ class Scatter(NamedTuple):
     variances: Float[np.ndarray, " n"]
 
 
+class _Triangle(NamedTuple):
+    """Column-pivoted QR of sensitivities, in units of their columns.
+
+    - `r`: the triangle. `order`: of the columns in it. `rank`: how many of these are independent.
+    - `scale`: units of the columns, in the order of the free numbers.
+    """
+
+    r: Float[np.ndarray, "p p"]
+    order: np.ndarray
+    rank: int
+    scale: Float[np.ndarray, " p"]
+
+    @staticmethod
+    def of(slopes: Float[np.ndarray, "n p"]) -> "_Triangle":
+        norms = np.linalg.norm(slopes, axis=0)
+        matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
+        scale = np.where(matters, norms, 1.0)
+        square = np.linalg.qr(np.where(matters, slopes / scale, 0.0), mode="r")
+        _, r, order = (np.asarray(part) for part in pivoted_qr(jnp.asarray(square)))
+        diagonal = np.abs(np.diagonal(r))
+        rank = int(np.sum(diagonal > DEPENDENT * max(diagonal[0], np.finfo(float).tiny)))
+        return _Triangle(r, order, rank, scale)
+
+    @property
+    def inverse(self) -> Float[np.ndarray, "r r"]:
+        """Of the independent columns."""
+        return np.linalg.inv(self.r[: self.rank, : self.rank]) if self.rank else np.zeros((0, 0))
+
+
+def leverages(slopes: Float[np.ndarray, "n p"]) -> Float[np.ndarray, " n"]:
+    """How many fitted numbers each row of a residual determines: the diagonal of J (Jᵀ J)⁺ Jᵀ, with J the slopes, (n,).
+
+    Rows of priors count as others do: what they determine, measurements do not.
+    """
+    triangle = _Triangle.of(slopes)
+    columns = triangle.order[: triangle.rank]
+    return np.sum((slopes[:, columns] / triangle.scale[columns] @ triangle.inverse) ** 2, axis=1)
+
+
 def uncertainty(
     residual: Float[np.ndarray, " n"],
     slopes: Float[np.ndarray, "n p"],
@@ -96,16 +135,8 @@ def uncertainty(
     **Arguments:** `scatter`: of the other rows; by default all have one noise, which is estimated.
     """
     count, size = len(slopes) - free.num_priors, slopes.shape[1]
-    norms = np.linalg.norm(slopes, axis=0)
-    matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
-    scale = np.where(matters, norms, 1.0)
-    square = np.linalg.qr(np.where(matters, slopes / scale, 0.0), mode="r")
-    _, r, order = (np.asarray(part) for part in pivoted_qr(jnp.asarray(square)))
-    diagonal = np.abs(np.diagonal(r))
-    rank = int(np.sum(diagonal > DEPENDENT * max(diagonal[0], np.finfo(float).tiny)))
-    to_free = np.zeros((size, size))
-    inverse = np.linalg.inv(r[:rank, :rank]) if rank else np.zeros((0, 0))
-    rows = order[:rank]
+    r, order, rank, scale = triangle = _Triangle.of(slopes)
+    to_free, inverse, rows = np.zeros((size, size)), triangle.inverse, order[:rank]
     to_free[np.ix_(rows, rows)] = inverse @ inverse.T / np.outer(scale[rows], scale[rows])
     gain = to_free @ slopes.T
     # What is left of the measurements when they have determined what priors leave to them.
