@@ -31,11 +31,11 @@ STEP = np.radians(20.0)
 STARTS, KEPT = 4000, 60
 
 
-def traced(topology, pins, angles, crank="O") -> lx.Trace:
+def traced(topology, pins, angles) -> lx.Trace:
     """A linkage followed along its crank, from as it is drawn."""
     bars, fixed = topology
     mechanism = lx.linkage(pins, bars, fixed)
-    return lx.trace(mechanism, lx.State.as_drawn(mechanism), {crank: angles}, throw=False)
+    return lx.trace(mechanism, lx.State.as_drawn(mechanism), {"O": angles}, throw=False)
 
 
 def lengths(pins, *pairs) -> jnp.ndarray:
@@ -81,8 +81,8 @@ def jansen_pins() -> dict[str, np.ndarray]:
     return pins | {"D": at("bde.D"), "E": at("ghi.E"), "P": at("ghi.F")}
 
 
-def box(pins: str, low: float, high: float, shape=(2,)) -> dict[str, lx.Bounded]:
-    return {pin: lx.Bounded(np.full(shape, 0.5 * (low + high)), low, high) for pin in pins}
+def box(pins: str, low: float, high: float) -> dict[str, lx.Bounded]:
+    return {pin: lx.Bounded(np.full(2, 0.5 * (low + high)), low, high) for pin in pins}
 
 
 INPUT = np.linspace(0.0, np.radians(120.0), 13)
@@ -121,7 +121,7 @@ def problems() -> dict[str, Problem]:
     turned = STEP * np.arange(len(OVAL))
     six = lambda topology, body: Problem(on_path(topology, body, OVAL, turned), box("OABCDEFP", -2.0, 3.0), 0.0349)
     own = jansen_pins()
-    leg = lambda pins: traced(JANSEN, pins, np.linspace(0.0, 2.0 * np.pi, 37), "O").position("ghi", "P")[:, :2]
+    leg = lambda pins: traced(JANSEN, pins, np.linspace(0.0, 2.0 * np.pi, 37)).position("ghi", "P")[:, :2]
     around = np.asarray(leg(own))[:-1]
     whole = on_path(JANSEN, "ghi", around, STEP / 2.0 * np.arange(36))
     shifted = lambda shifts: whole({pin: place + shifts[pin] for pin, place in own.items()})

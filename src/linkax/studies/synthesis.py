@@ -134,8 +134,7 @@ class _Judge(eqx.Module):
     def residual(self, params: Any, weight: Float[Array, ""]) -> tuple[Any, list[Array]]:
         """The error, and by how much conditions are missed, infinite where they are not finite."""
         found = self.candidate(params)
-        missed = lambda value: jnp.where(jnp.isfinite(value), weight * jnp.minimum(value, 0.0), jnp.inf)
-        return found.error, [missed(value) for value in found.conditions.values()]
+        return found.error, [weight * missed for missed in _missed(found)]
 
     @eqx.filter_jit
     def judged(self, z: Float[Array, "n p"]) -> "_Judged":
@@ -143,9 +142,8 @@ class _Judge(eqx.Module):
 
         def of(z):
             found = self.candidate(self.free.params(z))
-            error, missed = self.residual(self.free.params(z), jnp.ones(()))
             least: dict[str, Any] = {name: jnp.min(value) for name, value in found.conditions.items()}
-            return _Judged(_square(error), _square(missed), least)
+            return _Judged(_square(found.error), _square(_missed(found)), least)
 
         return jax.vmap(of)(z)
 
@@ -162,6 +160,12 @@ class _Judged(NamedTuple):
     errors: Float[Array | np.ndarray, " n"]
     misses: Float[Array | np.ndarray, " n"]
     least: dict[str, Float[Array | np.ndarray, " n"]]
+
+
+def _missed(found) -> list[Array]:
+    """By how much conditions are missed, infinite where they are not finite."""
+    values = found.conditions.values()
+    return [jnp.where(jnp.isfinite(value), jnp.minimum(value, 0.0), jnp.inf) for value in values]
 
 
 def _square(tree) -> Float[Array, ""]:
