@@ -265,7 +265,7 @@ def bad_fits(known):
         "args": (experiment(right), {"args": (1.0,)}, "give them to the experiments"),
         "checkpoint": (experiment(right), {"checkpoint": "fit.npz"}, "give all sensors a noise"),
         "no experiments": ([], {}, "there are no experiments in the list"),
-        "something else": ([experiment(right), 1.0], {}, "an entry of a list to fit is 1.0"),
+        "something else": ([experiment(right), 1.0], {}, "an entry of the experiments is 1.0"),
         "contradiction": ([experiment(right), experiment(other)], {}, "sensors of channel 'encoder' differ in their"),
     }
 

@@ -79,6 +79,8 @@ def test_a_report_of_a_function(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="give another path than"):
         found.report(tmp_path / "file" / "fit.html")
+    with pytest.raises(ValueError, match="fit of a function, which has no sensors; call it"):
+        found.predict()
     loss = lx.fit(lambda p: (p["x"] - 1.0) ** 2, {"x": 2.0}, steps=3)
     assert "no covariance" in loss.report(tmp_path / "loss.html").read_text().lower()
 
@@ -100,3 +102,22 @@ def test_whiteness_is_told_as_often_as_its_probability_says():
     assert np.mean(correlated) > 0.95
     assert Whiteness.of(np.ones(50)) is None
     assert Whiteness.of(np.arange(5.0)) is None
+
+
+def test_what_cannot_be_predicted_is_told_before_anything_is_written(fits, still, tmp_path):
+    found, held_out = fits
+    seen = lambda name, ts, values, sensor: lx.Experiment(lambda params: still, {name: (ts, values)}, {name: sensor})
+    beyond = seen("wheel", TIMES + 1.0, np.zeros(120), lx.Encoder("hinge", noise=1.0))
+    unknown = seen("wheel", TIMES, np.zeros(120), lx.Encoder("hinge"))
+    wide = seen("encoder <1>", TIMES, np.zeros((120, 3)), lx.Tracker("arm"))
+    outside = r"channel 'wheel' of experiment 1 cannot be predicted with the fitted parameters: time .* is outside"
+    for given, told in (
+        ([held_out, beyond], outside),
+        (unknown, "channel 'wheel' is held out, and this fit found no noise for it; give one to its sensor"),
+        (wide, r"'encoder <1>' is held out with values of shape \(3,\), and its noise was found with shape \(\)"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            found.report(tmp_path / "fit.html", given)
+    with pytest.raises(ValueError, match=outside):
+        found.predict([held_out, beyond])
+    assert list(tmp_path.iterdir()) == []

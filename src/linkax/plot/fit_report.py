@@ -53,7 +53,7 @@ class _Component(NamedTuple):
 def report(fit: Fit, path: Path, held_out: Sequence[Experiment]) -> Path:
     """Write the page, see `linkax.Fit.report`.
 
-    **Raises:** `ValueError` for a folder that cannot be written to.
+    **Raises:** as `linkax.Fit.report`.
     """
     writable_folder(path.parent, f"give another path than {str(path)!r}")
     title = f"Fit: {fit.ended} after {count(fit.steps, 'step')}"
@@ -182,13 +182,26 @@ def _records(fit, experiments) -> list[str]:
     for place, (experiment, predicted) in enumerate(zip(experiments, fit.predict(experiments), strict=True)):
         sensors = experiment.sensors_at(fit.params)
         for name, sensor in sensors.items():
-            noise = (fit.noises or {}).get(name, np.nan) if sensor.noise is None else np.asarray(sensor.noise)
             channel = experiment.record[name]
+            noise = _noise(fit, name, channel) if sensor.noise is None else np.asarray(sensor.noise)
             head = f"experiment {place}: {name}" if len(experiments) > 1 else name
             told = f" ({type(sensor).__name__}, {sensor.loss})"
             parts.append(f"<h3>{escape(head + told)}</h3>")
             parts += _channel(_components(channel, predicted[name], noise, sensor.loss))
     return parts
+
+
+def _noise(fit, name, channel) -> np.ndarray:
+    """Of a channel whose sensor gives none."""
+    found, shape = (fit.noises or {}).get(name), channel.values.shape[1:]
+    if found is None:
+        raise ValueError(f"channel {name!r} is held out, and this fit found no noise for it; give one to its sensor")
+    if np.shape(found) != shape:
+        raise ValueError(
+            f"channel {name!r} is held out with values of shape {shape}, and its noise was found with shape "
+            f"{np.shape(found)}; give the channels different names"
+        )
+    return found
 
 
 def _components(channel, predicted, noise, loss: Loss) -> list[_Component]:

@@ -23,7 +23,7 @@ from linkax.studies.fit_search import (
     sensitivity,
 )
 from linkax.studies.free_parameters import FreeParameters
-from linkax.studies.laboratory import Laboratory
+from linkax.studies.laboratory import FITTED, Laboratory
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.parameters import as_arrays
 from linkax.studies.uncertainty import DEPENDENT, uncertainty
@@ -138,7 +138,7 @@ def _laboratory(experiments, free, args, checkpoint) -> tuple[Laboratory, Callab
             f"checkpoint is {checkpoint!r}; a fit that finds the noise keeps none: give all sensors a noise"
         )
     with compiling():
-        errors = laboratory.errors(start)
+        errors = laboratory.errors(start, "where the fit starts")
     return laboratory, laboratory.together, (laboratory.noise(errors),)
 
 
@@ -150,7 +150,7 @@ def _settled(again, search, laboratory, z, data, steps, losses, ended):
     **Warns:** where it does not.
     """
     for count in range(ROUNDS + 1):
-        errors, (before,) = laboratory.errors(search.free.params(z)), data
+        errors, (before,) = laboratory.errors(search.free.params(z), FITTED), data
         slopes = np.asarray(sensitivity(search, z, data)[1])
         if not np.all(np.isfinite(slopes)):
             break
@@ -219,7 +219,7 @@ def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> F
     loss, count, scatter = float(0.5 * residual @ residual), len(residual) - search.free.num_priors, None
     there, factors = np.ones(len(residual), bool), np.ones(len(residual))
     if laboratory is not None:
-        errors = laboratory.errors(search.free.params(z))
+        errors = laboratory.errors(search.free.params(z), FITTED)
         worth = laboratory.worth(errors, args[0], slopes)
         there[:count], factors[:count], scatter = errors.there, worth.factors, worth.scatter
     count = int(np.sum(there[:count]))

@@ -11,7 +11,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from linkax.model.numbers import require_type, whole_number
-from linkax.studies.experiments import Experiment, Experiments, predict
+from linkax.studies.experiments import Experiment
+from linkax.studies.laboratory import FITTED, Laboratory
 from linkax.studies.uncertainty import Spread
 from linkax.tables import Rows, Table, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
@@ -140,10 +141,16 @@ class Fit(NamedTuple):
         """What sensors would tell without noise, {channel: (n,) or (n, k)} of each experiment.
 
         **Arguments:** `experiments`: by default those that were fitted; give others to see how well they are predicted.
+
+        **Raises:** `ValueError` for a fit of a function without `experiments`, and where the prediction of a sample is
+        not finite, as of records that reach beyond the saved times of the model's run.
         """
-        experiments = self.experiments if experiments is None else experiments
-        given = [experiments] if isinstance(experiments, Experiment) else list(experiments)
-        return jax.tree.map(np.asarray, predict(Experiments.of(given), self.params))
+        if experiments is None and not self.experiments:
+            raise ValueError(
+                "this is the fit of a function, which has no sensors; call it with fit.params, or give experiments"
+            )
+        given = self.experiments if experiments is None else experiments
+        return Laboratory.of(given, self.params).predict(self.params, FITTED)
 
     def report(self, path: str | os.PathLike, held_out: Experiment | Sequence[Experiment] = ()) -> Path:
         """Write a report as one HTML file, which needs no network.
@@ -154,8 +161,8 @@ class Fit(NamedTuple):
 
         **Arguments:** `path`: of the file. `held_out`: experiments that were not fitted.
 
-        **Raises:** `ValueError` for a folder that cannot be written to, and records without samples at which the motion
-        is known.
+        **Raises:** `ValueError` for a folder that cannot be written to, records that cannot be predicted, as `predict`
+        does, and channels held out whose noise is not known.
         """
         from linkax.plot.fit_report import report
 

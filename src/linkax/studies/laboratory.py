@@ -17,6 +17,7 @@ from linkax.studies.uncertainty import Scatter, leverages
 from linkax.xla.users_line import warn
 
 TELLING = 0.05  # mean curvature of a robust loss, above which it tells how sure a fit is
+FITTED = "with the fitted parameters"
 LEAST = 1e-9  # noise relative to the largest measurement, below which it is rounding
 
 
@@ -71,12 +72,10 @@ class Laboratory(NamedTuple):
         found = [experiments] if isinstance(experiments, Experiment) else list(experiments)
         for each in found:
             require_type(
-                each, Experiment, "an entry of a list to fit", "give linkax.Experiment(model, record, sensors)"
+                each, Experiment, "an entry of the experiments", "give linkax.Experiment(model, record, sensors)"
             )
         if not found:
-            raise ValueError(
-                "there are no experiments in the list to fit; give linkax.Experiment(model, record, sensors)"
-            )
+            raise ValueError("there are no experiments in the list; give linkax.Experiment(model, record, sensors)")
         for each in filter(lambda each: callable(each.sensors), found):
             jax.eval_shape(partial(_check_noise, each), params)
         return Laboratory(found, Experiments.of(found), [each.sensors_at(params) for each in found])
@@ -108,17 +107,27 @@ class Laboratory(NamedTuple):
             [np.ravel(of_channel(i, name)) for i, each in enumerate(self.sensors) for name in sorted(each)]
         )
 
-    def errors(self, params: Any) -> Errors:
+    def predict(self, params: Any, where: str) -> list[dict[str, np.ndarray]]:
+        """What the sensors would tell, by channel of each experiment; `where` these parameters are, for errors.
+
+        **Raises:** `ValueError` where a prediction of what was measured is not finite, with the reason.
+        """
+        predicted = jax.tree.map(np.asarray, predict(self.together, params))
+        for place, (experiment, found) in enumerate(zip(self.experiments, predicted, strict=True)):
+            for name, values in found.items():
+                if not np.all(np.isfinite(values) | np.isnan(experiment.record[name].values)):
+                    raise ValueError(self._reason(place, name, params, where))
+        return predicted
+
+    def errors(self, params: Any, where: str) -> Errors:
         """What predictions are off.
 
-        **Raises:** `ValueError` where they are not finite, with the reason.
+        **Raises:** as `predict`.
         """
-        predicted = predict(self.together, params)
+        predicted = self.predict(params, where)
         measured = lambda i, name: np.asarray(self.experiments[i].record[name].values)
-        values = self._rows(lambda i, name: np.asarray(predicted[i][name]) - measured(i, name))
+        values = self._rows(lambda i, name: predicted[i][name] - measured(i, name))
         missing = np.isnan(self._rows(measured))
-        if not np.all(np.isfinite(values) | missing):
-            raise ValueError(self._reason(predicted, params))
         sizes = {
             name: max(np.shape(measured(i, name))[1:], default=1)
             for i, each in enumerate(self.sensors)
@@ -131,18 +140,16 @@ class Laboratory(NamedTuple):
         )
         return Errors(np.where(missing, np.nan, values), self._rows(index), names)
 
-    def _reason(self, predicted, params) -> str:
+    def _reason(self, place, name, params, where) -> str:
         """Why a prediction is not finite, found without programs."""
-        is_bad = lambda i, name: not np.all(np.isfinite(np.asarray(predicted[i][name])))
-        place, name = next((i, name) for i, each in enumerate(self.sensors) for name in each if is_bad(i, name))
         experiment = self.experiments[place]
         which = f"channel {name!r}" + (f" of experiment {place}" if len(self.experiments) > 1 else "")
         try:
             solution = experiment.model(params, *experiment.args)
-            self.sensors[place][name].predict(solution, experiment.record[name].ts)
+            experiment.sensors_at(params)[name].predict(solution, experiment.record[name].ts)
         except Exception as error:
-            return f"{which} cannot be predicted where the fit starts: {error}"
-        return f"{which} is not predicted to be finite where the fit starts; look at the solution of its model"
+            return f"{which} cannot be predicted {where}: {error}"
+        return f"{which} is not predicted to be finite {where}; look at the solution of its model"
 
     def noise(self, errors: Errors, lost: Float[np.ndarray, " n"] | None = None) -> Noise:
         """Estimate the noise of sensors that give none, by channel.
