@@ -266,6 +266,11 @@ def bad_fits(known):
         "checkpoint": (experiment(right), {"checkpoint": "fit.npz"}, "give all sensors a noise"),
         "no experiments": ([], {}, "there are no experiments in the list"),
         "something else": ([experiment(right), 1.0], {}, "an entry of the experiments is 1.0"),
+        "components": (
+            [experiment(right), experiment(wide, channel=(TIMES, np.zeros((len(TIMES), 3))))],
+            {},
+            "'encoder' tells 3 numbers in experiment 1, and one number in experiment 0; give the channels different",
+        ),
         "contradiction": ([experiment(right), experiment(other)], {}, "sensors of channel 'encoder' differ in their"),
     }
 

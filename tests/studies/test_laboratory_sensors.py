@@ -58,6 +58,18 @@ def test_gain_bias_delay_and_components(solution):
         lx.Encoder("hinge", components=(0,)).predict(solution, ts)
 
 
+def test_gain_bias_and_noise_are_one_number_or_one_for_each_component(solution):
+    """Also where there are as many times as numbers, which would be taken for one for each time."""
+    ts = np.linspace(0.2, 0.4, 3)
+    for sensor, told in (
+        (lx.Encoder("hinge", gain=np.ones(3)), r"gain of Encoder has shape \(3,\), and it tells one number"),
+        (lx.Tracker("arm", bias=np.ones(2)), r"bias of Tracker has shape \(2,\), and it tells 3 numbers; give one"),
+        (lx.Tracker("arm", noise=np.ones(3), components=0), r"noise of Tracker has shape \(3,\), and it tells one"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            sensor.predict(solution, ts)
+
+
 def test_an_inertial_unit_feels_acceleration_less_free_fall(solution):
     told = np.asarray(lx.InertialUnit("arm", "tip").reading(solution))
     ts, axes = np.asarray(solution.ts), np.asarray(solution.orientation("arm"))

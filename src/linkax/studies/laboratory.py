@@ -67,7 +67,7 @@ class Laboratory(NamedTuple):
     def of(experiments: Experiment | Sequence[Experiment], params: Any) -> "Laboratory":
         """Read one experiment or a list of them, at parameters.
 
-        **Raises:** `ValueError` for entries that are no experiments, and where sensors of one channel contradict.
+        **Raises:** `ValueError` for entries that are no experiments, and where the noise of a sensor is a parameter.
         """
         found = [experiments] if isinstance(experiments, Experiment) else list(experiments)
         for each in found:
@@ -84,17 +84,25 @@ class Laboratory(NamedTuple):
     def by_channel(self) -> dict[str, AbstractSensor]:
         """The first sensor of each channel.
 
-        **Raises:** `ValueError` where another one has another loss, or noise that is known.
+        **Raises:** `ValueError` where others differ in loss, in number of components, or in whether noise is known.
         """
-        first: dict[str, AbstractSensor] = {}
-        for name, sensor in ((name, sensor) for sensors in self.sensors for name, sensor in sensors.items()):
-            other = first.setdefault(name, sensor)
+        first: dict[str, tuple[int, AbstractSensor]] = {}
+        each = ((place, name, sensor) for place, sensors in enumerate(self.sensors) for name, sensor in sensors.items())
+        for place, name, sensor in each:
+            before, other = first.setdefault(name, (place, sensor))
             if (sensor.loss, sensor.noise is None) != (other.loss, other.noise is None):
                 raise ValueError(
                     f"sensors of channel {name!r} differ in their loss, or in whether their noise is known; give the "
                     "channels different names"
                 )
-        return first
+            shape, expected = (self.experiments[i].record[name].values.shape[1:] for i in (place, before))
+            if shape != expected:
+                told = lambda shape: f"{shape[0]} numbers" if shape else "one number"
+                raise ValueError(
+                    f"channel {name!r} tells {told(shape)} in experiment {place}, and {told(expected)} in experiment "
+                    f"{before}; give the channels different names"
+                )
+        return {name: sensor for name, (_, sensor) in first.items()}
 
     @property
     def finds_noise(self) -> bool:

@@ -95,7 +95,8 @@ class AbstractSensor(eqx.Module):
     def told(self, solution: Solution) -> Float[Array, "n_t ..."]:
         """What this instrument tells of a solution at `times`, without noise; (n_t,) or (n_t, k).
 
-        **Raises:** `ValueError` for components that the reading does not have.
+        **Raises:** `ValueError` for components that the reading does not have, and for gains, biases and noise that are
+        neither one number nor one for each component.
         """
         found = jnp.asarray(self.reading(solution))
         if self.components is not None:
@@ -106,12 +107,17 @@ class AbstractSensor(eqx.Module):
                     f"{count or 'no'} components{f', 0 to {count - 1}' if count else ''}"
                 )
             found = found[:, np.array(self.components)]
+        each = found.shape[1:]
+        for name in ("gain", "bias", "noise"):
+            if (shape := np.shape(getattr(self, name))) not in ((), each):
+                told = f"{each[0]} numbers; give one number, or {each[0]}" if each else "one number; give one"
+                raise ValueError(f"the {name} of {type(self).__name__} has shape {shape}, and it tells {told}")
         return self.gain * found + self.bias
 
     def predict(self, solution: Solution, ts: Float[Array, " n"] | Sequence[float]) -> Float[Array, "n ..."]:
         """What this instrument tells at times `ts` [s] of a motion, without noise; (n,) or (n, k).
 
-        **Raises:** `ValueError` as `Solution.at` does.
+        **Raises:** `ValueError` as `Solution.at` and `told` do.
         """
         return self.told(solution.at(self.times(jnp.asarray(real(ts, "times [s]")))))
 
