@@ -190,6 +190,28 @@ def test_experiments_of_a_kind_are_one_batch(known, motion):
     np.testing.assert_allclose(held_out[0]["encoder"], values[1], rtol=1e-6)
 
 
+@pytest.mark.parametrize("loss", ["squares", "huber"])
+def test_profiles_of_experiments_are_those_of_their_covariance(known, loss):
+    """Of sensors that are linear; of a robust loss near the fit, where its curvature tells less than its scatter."""
+    values = told(known, 0, 0.0 if loss == "squares" else 0.1)
+    values[3] = np.nan
+    sensors = lambda params: {"encoder": lx.Encoder("hinge", gain=params["gain"], bias=params["bias"], loss=loss)}
+    experiment = lx.Experiment(known, {"encoder": (TIMES, values)}, sensors)
+    start = {"gain": 1.0, "bias": 0.0} if loss == "squares" else {"gain": lx.Normal(1.05, 1e-9), "bias": 0.0}
+    found = lx.fit(experiment, start, tolerance=1e-9)
+    best, error = found.params["bias"], found.standard_errors["bias"]
+    expected = np.array([-1.5, -0.5, 0.5, 1.5]) * (1.0 if loss == "squares" else 0.02)
+    with pytest.warns(UserWarning, match="does not rise"):
+        profile = lx.profile(experiment, found, "bias", values=best + expected * error)
+    np.testing.assert_allclose(np.ptp(profile.roots), np.ptp(expected), rtol=1e-3)
+    np.testing.assert_allclose(profile.roots, expected, atol=1e-3)
+    assert np.all(profile.converged)
+    with pytest.raises(ValueError, match="give them to the experiments"):
+        lx.profile(experiment, found, "bias", (1.0,))
+    with pytest.raises(ValueError, match="found the fit of a function; give that one"):
+        lx.profile(experiment, lx.fit(lambda p: p["bias"] - TIMES, {"bias": 1.0}), "bias")
+
+
 def test_numbers_tied_to_each_other(known, motion):
     """One number in two places: no more than a function of the parameters."""
     values = 1.1 * np.asarray(motion.at(TIMES).joint("hinge")) + 0.05

@@ -59,8 +59,12 @@ class AbstractSearch(eqx.Module):
         return found + 0.5 * jnp.sum(prior**2) if self.is_loss else jnp.concatenate([found, prior])
 
     @abc.abstractmethod
-    def evaluated(self, z: Float[Array, " p"], state: Any, args: tuple) -> Evaluation:
-        """What the next step needs that a program of its own computes; `state`: None before there is one."""
+    def tried(self, z: Float[Array, "..."], state: Any) -> Float[Array, "..."]:
+        """Where the next step evaluates the function, of one search or several; `state`: None before there is one."""
+
+    @abc.abstractmethod
+    def evaluated(self, z: Float[Array, " p"], args: tuple) -> Evaluation:
+        """What the next step needs that a program of its own computes, at `tried`."""
 
     @abc.abstractmethod
     def begin(self, z: Float[Array, " p"], found: Evaluation) -> Any:
@@ -85,8 +89,11 @@ def sensitivity(
 class Squares(AbstractSearch):
     """Steps of a least-squares solver of optimistix, by the residual and its Jacobian, which `sensitivity` computes."""
 
-    def evaluated(self, z: Float[Array, " p"], state: Any, args: tuple) -> Evaluation:
-        return sensitivity(self, z if state is None else state.y_eval, args)
+    def tried(self, z: Float[Array, "..."], state: Any) -> Float[Array, "..."]:
+        return z if state is None else state.y_eval
+
+    def evaluated(self, z: Float[Array, " p"], args: tuple) -> Evaluation:
+        return sensitivity(self, z, args)
 
     def begin(self, z: Float[Array, " p"], found: Evaluation) -> Any:
         residual = cast(Any, found)[0]
@@ -111,7 +118,10 @@ def _residual(value, slopes):
 class Descent(AbstractSearch):
     """Steps of an optimiser of optax, which never tells that it has converged."""
 
-    def evaluated(self, z: Float[Array, " p"], state: Any, args: tuple) -> Evaluation:
+    def tried(self, z: Float[Array, "..."], state: Any) -> Float[Array, "..."]:
+        return z
+
+    def evaluated(self, z: Float[Array, " p"], args: tuple) -> Evaluation:
         return ()
 
     def begin(self, z: Float[Array, " p"], found: Evaluation) -> Any:
@@ -161,7 +171,7 @@ def run_search(
     """
     z = search.free.start if start is None else start
     with compiling():
-        found = search.evaluated(z, None, args)
+        found = search.evaluated(search.tried(z, None), args)
         state = _begin(search, z, found)
     losses, best, best_z, waited = [], np.inf, z, 0
     kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, state, args, found)
@@ -172,7 +182,7 @@ def run_search(
     with Progress(steps, "step", progress) as line:
         while ended is None and len(losses) < steps + 1:
             before = z
-            found = search.evaluated(z, state, args) if found is None else found
+            found = search.evaluated(search.tried(z, state), args) if found is None else found
             with compiling(not losses):
                 z, state, loss, smooth, done = _step(search, z, state, args, found)
             loss, found = float(loss), None
@@ -190,9 +200,8 @@ def run_search(
 
 
 @eqx.filter_jit
-def _evaluated_each(search, z, state, args):
-    over = eqx.if_array(0)
-    return eqx.filter_vmap(lambda z, state: search.evaluated(z, state, args), in_axes=(0, over))(z, state)
+def _evaluated_each(search, z, args):
+    return eqx.filter_vmap(lambda z: search.evaluated(z, args))(z)
 
 
 @eqx.filter_jit
@@ -222,14 +231,14 @@ def search_from_each(
     z, ended = starts, [""] * len(starts)
     best_z, best = np.array(starts), np.full(len(starts), np.inf)
     with compiling():
-        found = _evaluated_each(search, z, None, args)
+        found = _evaluated_each(search, search.tried(z, None), args)
         state = _begin_each(search, z, found)
     with Progress(steps, "step", progress) as line:
         for count in range(steps + 1):
             active = np.array([not reason for reason in ended])
             if not np.any(active):
                 break
-            found = _evaluated_each(search, z, state, args) if found is None else found
+            found = _evaluated_each(search, search.tried(z, state), args) if found is None else found
             before = z
             with compiling(count == 0):
                 z, state, loss, smooth, done = _step_each(search, z, state, args, found, jnp.asarray(active))

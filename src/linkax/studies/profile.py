@@ -6,12 +6,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
+from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float
 
 from linkax.model.numbers import is_finite, number, real, require, require_type, whole_number
+from linkax.studies.experiments import Experiment
 from linkax.studies.fit_result import Fit
+from linkax.studies.fit_search import Squares, search_from_each, sensitivity
+from linkax.studies.laboratory import Laboratory
 from linkax.studies.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.parameters import as_arrays
 from linkax.studies.profile_result import Profile
@@ -27,8 +30,17 @@ ROUNDING = 1e-8  # of a residual
 BETTER = 1e-3  # of the noise squared: by how much less a loss is that of another minimum
 
 
+class _Held(Squares):
+    """Steps that leave one entry of z as it is, since the residual seems not to depend on it."""
+
+    entry: int = eqx.field(static=True)
+
+    def flat(self, z: Float[Array, " p"], args: tuple) -> Float[Array, " n"]:
+        return super().flat(jnp.where(jnp.arange(len(z)) == self.entry, lax.stop_gradient(z), z), args)
+
+
 def profile(
-    function: Callable,
+    function: Callable | Experiment | Sequence[Experiment],
     found: Fit,
     name: str,
     args: tuple | list = (),
@@ -46,7 +58,8 @@ def profile(
 
     **Arguments:**
 
-    - `function`, `args`: the residual and its further arguments, as they were fitted. `found`: the `Fit`.
+    - `function`, `args`: the residual and its further arguments, or the experiments, as they were fitted. `found`: the
+      `Fit`, whose noise of sensors stays.
     - `name`: of a number among `found.names`, such as "mass", or "springs[1]" of an array.
     - `values`: of that number, (n,), in any order. By default `count` ones that reach twice as far as the interval of
       95 %, or, where the data determine none, as far as the parameter itself.
@@ -54,7 +67,8 @@ def profile(
 
     **Returns:** a `Profile`. A refit that fails is marked, and harms no other.
 
-    Priors are parts of the likelihood; the residual must then be in units of its noise.
+    Priors are parts of the likelihood; the residual must then be in units of its noise. Near the fit, intervals are
+    those of its covariance, with priors and robust losses, too.
 
     **Raises:** `ValueError` for a fit without covariance or without noise, for a name that is none of its numbers or
     one of a `PhysicalInertia`, which depends on others, for values that are not finite, out of bounds or given twice,
@@ -63,13 +77,16 @@ def profile(
     **Warns:** where the profile does not rise to the threshold of 95 % on some side, as where the data do not determine
     the number, and where some refit is better than the fit.
     """
-    require_type(function, Callable, "function", "give the residual that was fitted, a function of (params, *args)")
+    kinds = Callable | Experiment | list | tuple
+    require_type(function, kinds, "function", "give what was fitted, a function of (params, *args) or experiments")
     require_type(found, Fit, "found", "give what linkax.fit returned")
     spread = found.determined()
     if not spread.noise > 0.0:
         raise ValueError("the fit is exact, so that its residual tells of no noise; profile one of data with noise")
     require_type(args, list | tuple, "args", "give a tuple of what else the function gets")
     data = as_arrays(tuple(args), "args")
+    if not callable(function):
+        function, data = _of_experiments(function, found, args)
     whole_number(steps, "steps")
     finer = lambda x: x >= 0.0
     tolerance = float(require(number(tolerance, (), "tolerance"), finer, "tolerance", "it must be zero or more"))
@@ -78,12 +95,12 @@ def profile(
         places = _default_places(spread, entry, whole_number(count, "count", least=3))
     else:
         places = _places_of(spread.free, spread.z, index, entry, _checked(values), name)
-    fixed = tuple(i for i in range(len(spread.z)) if i != entry)
-    starts = _starts(spread, entry, places, fixed)
+    given = LevenbergMarquardt(tolerance, tolerance), function, spread.free, None, False
     with compiling():
-        z, losses, converged = _refitted(function, spread.free, data, fixed, entry, places, starts, steps, tolerance)
-        again = _loss(function, spread.free, data, spread.z)
-    _check_same(float(again), found.loss, len(found.residual))
+        again, _ = sensitivity(Squares(*given), spread.z, data)
+    _check_same(float(0.5 * again @ again), found.loss, len(found.residual))
+    z, losses, ended = search_from_each(_Held(*given, entry), _starts(spread, entry, places), data, steps, None)
+    z = jnp.asarray(z).at[:, entry].set(places)  # but for rounding they are there
     params = jax.tree.map(np.asarray, jax.vmap(spread.free.params)(z))
     numbers = np.asarray(jax.vmap(spread.free.vector)(z)[:, index])
     order = np.argsort(numbers)
@@ -91,15 +108,24 @@ def profile(
         name=name,
         best=float(np.asarray(spread.free.vector(spread.z))[index]),
         values=numbers[order],
-        losses=np.asarray(losses)[order],
+        losses=losses[order],
         params=jax.tree.map(lambda leaf: leaf[order], params),
-        converged=np.asarray(converged)[order],
+        converged=(np.array(ended) == "converged")[order],
         loss=found.loss,
-        noise=1.0 if spread.free.num_priors else spread.noise,
+        noise=_unit(spread, entry),
         freedom=spread.freedom,
     )
     _warn(result)
     return result
+
+
+def _of_experiments(experiments, found, args):
+    """The residual of experiments, and its argument."""
+    if len(args):
+        raise ValueError(f"args are {args!r}; give them to the experiments, linkax.Experiment(..., args=)")
+    if found.noises is None:
+        raise ValueError("function is experiments, and found the fit of a function; give that one")
+    return Laboratory.of(experiments, found.params).together, (as_arrays(found.noises, "noises"),)
 
 
 def _place(found, free, name) -> tuple[int, int]:
@@ -139,46 +165,25 @@ def _places_of(free, z, index, entry, values, name):
     return places
 
 
-def _starts(spread, entry, places, others) -> Float[Array, "n q"]:
-    """The other free numbers, where the covariance puts them."""
+def _starts(spread, entry, places) -> Float[Array, "n p"]:
+    """The free numbers, the others where the covariance puts them."""
     variance = spread.of_free[entry, entry]
-    along = spread.of_free[list(others), entry] / variance if variance else 0.0
-    return jnp.asarray(np.asarray(spread.z)[list(others)] + np.outer(np.asarray(places) - spread.z[entry], along))
+    along = spread.of_free[:, entry] / variance if variance else np.zeros(len(spread.z))
+    along[entry] = 1.0
+    return spread.z + jnp.outer(places - spread.z[entry], jnp.asarray(along))
 
 
-@eqx.filter_jit
-def _loss(function, free, args, z):
-    return 0.5 * jnp.sum(_residual(function, free, args, z) ** 2)
-
-
-def _residual(function, free, args, z):
-    """With that of priors."""
-    return jnp.concatenate([ravel_pytree(function(free.params(z), *args))[0], free.prior(z)])
-
-
-@eqx.filter_jit
-def _refitted(function, free, args, others, entry, places, starts, steps, tolerance):
-    """z, loss, and whether it converged, of each refit."""
-    others, solver = jnp.array(others, int), LevenbergMarquardt(tolerance, tolerance)
-
-    def refit(place, start):
-        whole = lambda rest: jnp.zeros(len(free.start)).at[others].set(rest).at[entry].set(place)
-        residual = lambda rest, _: _residual(function, free, args, whole(rest))
-        rest, converged = start, jnp.array(True)
-        if len(others):
-            found = optx.least_squares(residual, solver, start, max_steps=steps, throw=False)
-            rest, converged = found.value, found.result == optx.RESULTS.successful
-        loss = 0.5 * jnp.sum(residual(rest, None) ** 2)
-        return whole(rest), loss, converged & jnp.isfinite(loss)
-
-    return jax.vmap(refit)(places, starts)
+def _unit(spread, entry) -> float:
+    """Standard deviation of a free number, over what the curvature of the loss makes it for noise of one."""
+    curved = spread.unscaled[entry, entry]
+    return float(np.sqrt(spread.of_free[entry, entry] / curved)) if curved else spread.noise
 
 
 def _check_same(loss, fitted, count):
     if not np.isclose(loss, fitted, rtol=1e-6, atol=ROUNDING**2 * count):
         raise ValueError(
             f"function has the loss {one(loss)} at the fitted parameters, and the fit {one(fitted)}; give the residual "
-            "and the args that were fitted"
+            "and the args that were fitted, or the experiments"
         )
 
 

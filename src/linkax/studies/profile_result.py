@@ -26,7 +26,8 @@ class Profile(NamedTuple):
     - `losses`: half the sum of squares of each refit, (n,). `loss`: that of the fit.
     - `params`: of each refit, in the structure of `Fit.params` with a leading axis.
     - `converged`: whether each refit did, (n,); others count for nothing.
-    - `noise`: standard deviation of the residual. `freedom`: its degrees of freedom.
+    - `noise`: of the residual, for this number: its standard error over what the curvature of the loss makes it for
+      noise of one; without priors and robust losses, the standard deviation. `freedom`: its degrees of freedom.
     """
 
     name: str

@@ -22,7 +22,8 @@ class Spread(NamedTuple):
 
     - `free`, `z`: the parameters as functions of free numbers, and these as fitted, (p,).
     - `covariance`: of the numbers, (n, n). `of_free`: of the free numbers, (p, p); zero where the data do not determine
-      them. `deviation`: their standard deviations, (p,), infinite there.
+      them. `deviation`: their standard deviations, (p,), infinite there. `unscaled`: what `of_free` were if all rows of
+      the residual had variance one.
     - `noise`: standard deviation of the residual. `freedom`: its degrees of freedom.
     """
 
@@ -31,6 +32,7 @@ class Spread(NamedTuple):
     covariance: Float[np.ndarray, "n n"]
     of_free: Float[np.ndarray, "p p"]
     deviation: Float[np.ndarray, " p"]
+    unscaled: Float[np.ndarray, "p p"]
     noise: float
     freedom: float
 
@@ -162,5 +164,5 @@ def uncertainty(
     covariance[undetermined, undetermined] = np.inf
     deviation = np.sqrt(np.where(lost, np.inf, np.diagonal(of_free)))
     names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
-    spread = Spread(free, z, covariance, of_free, deviation, scatter.noise, freedom)
+    spread = Spread(free, z, covariance, of_free, deviation, to_free, scatter.noise, freedom)
     return Uncertainty(covariance, scatter.noise, names, spread)
