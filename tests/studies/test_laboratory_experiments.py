@@ -268,6 +268,19 @@ def test_several_starts_are_one_batch():
             lx.fit(residual, start, (data,), starts=wrong)
 
 
+def test_starts_alone_need_to_be_predicted(known):
+    """`params` and one start ask for times before the run; noise is that of the best of the others."""
+    experiment = lx.Experiment(known, {"encoder": (TIMES, told(known, 0))}, SENSORS["squares"])
+    starts = {"gain": np.ones(3), "bias": np.array([0.0, 0.1, 5.0]), "delay": np.array([0.5, 0.0, 0.0])}
+    found = lx.fit(experiment, START | {"delay": 0.5}, starts=starts)
+    assert found.starts.ended[0] == "diverged"
+    again = lx.fit(experiment, START)
+    for name in START:
+        np.testing.assert_allclose(found.params[name], again.params[name], rtol=1e-5)
+    with pytest.raises(ValueError, match=r"'encoder' cannot be predicted where the fit starts: time -0\.4 s"):
+        lx.fit(experiment, START, starts={name: values[:1] for name, values in starts.items()})
+
+
 def bad_fits(known):
     """(experiments, params, options, what is told)"""
     channel = (TIMES, np.zeros(len(TIMES)))

@@ -88,7 +88,8 @@ def fit(
     - `checkpoint`: a file, written at each step, from which the same fit goes on after it was killed or out of steps.
     - `progress`: whether to show a progress bar; by default where the output is a terminal.
     - `starts`: what `params` are, with plain numbers and one axis before theirs: the fit searches from each, computed
-      as one batch, and goes on from the best. `Fit.starts` tells where the others led; one that fails harms no other.
+      as one batch, and goes on from the best; `params` are then no start. `Fit.starts` tells where the others led; one
+      that fails harms no other.
 
     **Returns:** a `Fit`.
 
@@ -106,15 +107,16 @@ def fit(
     require_type(args, list | tuple, "args", "give a tuple of what else the function gets")
     data = as_arrays(tuple(args), "args")
     _check_ending(steps, tolerance, patience)
+    places = None if starts is None else free.starts(starts)
     laboratory = None
     if not callable(function):
-        laboratory, function, data = _laboratory(function, free, args, checkpoint)
+        laboratory, function, data = _laboratory(function, free, args, checkpoint, places)
     is_loss = _is_loss(function, free, data)
     search = _search_by(optimiser, function, free, mode, is_loss, tolerance)
     steps = DEFAULT_STEPS["loss" if is_loss else "residual"] if steps is None else steps
     z, others = None, None
-    if starts is not None:
-        z, others = _best_start(search, free.starts(starts), data, steps, progress)
+    if places is not None:
+        z, others = _best_start(search, places, data, steps, progress)
     z, losses, ended = run_search(search, data, steps, tolerance, patience, checkpoint, progress, z)
     if laboratory is not None and laboratory.finds_noise:
         again = lambda data, z, left: run_search(search, data, left, tolerance, patience, None, progress, z)
@@ -127,19 +129,18 @@ def fit(
     return result._replace(starts=others)
 
 
-def _laboratory(experiments, free, args, checkpoint) -> tuple[Laboratory, Callable, tuple]:
+def _laboratory(experiments, free, args, checkpoint, starts) -> tuple[Laboratory, Callable, tuple]:
     """Experiments, their residual, and its argument: the noise that is found where the fit starts."""
     if len(args):
         raise ValueError(f"args are {args!r}; give them to the experiments, linkax.Experiment(..., args=)")
-    start = free.params(free.start)
-    laboratory = Laboratory.of(experiments, start)
+    laboratory = Laboratory.of(experiments, free.params(free.start))
     if laboratory.finds_noise and checkpoint is not None:
         raise ValueError(
             f"checkpoint is {checkpoint!r}; a fit that finds the noise keeps none: give all sensors a noise"
         )
     with compiling():
-        errors = laboratory.errors(start, "where the fit starts")
-    return laboratory, laboratory.together, (laboratory.noise(errors),)
+        noise = laboratory.first_noise([free.params(z) for z in ([free.start] if starts is None else starts)])
+    return laboratory, laboratory.together, (noise,)
 
 
 def _settled(again, search, laboratory, z, data, steps, losses, ended):

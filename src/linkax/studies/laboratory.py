@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from linkax.model.numbers import require_type
 from linkax.studies.experiments import Experiment, Experiments, Noise, predict
-from linkax.studies.losses import Loss, influence, spread
+from linkax.studies.losses import Loss, as_square, influence, spread
 from linkax.studies.sensors import AbstractSensor
 from linkax.studies.uncertainty import Scatter, leverages
 from linkax.xla.users_line import warn
@@ -120,19 +120,30 @@ class Laboratory(NamedTuple):
 
         **Raises:** `ValueError` where a prediction of what was measured is not finite, with the reason.
         """
-        predicted = jax.tree.map(np.asarray, predict(self.together, params))
+        predicted = self._predicted(params)
+        if (bad := self._not_finite(predicted)) is not None:
+            raise ValueError(self._reason(*bad, params, where))
+        return predicted
+
+    def _predicted(self, params) -> list[dict[str, np.ndarray]]:
+        return jax.tree.map(np.asarray, predict(self.together, params))
+
+    def _not_finite(self, predicted) -> tuple[int, str] | None:
+        """The first experiment and channel of which a prediction of what was measured is not finite."""
         for place, (experiment, found) in enumerate(zip(self.experiments, predicted, strict=True)):
             for name, values in found.items():
                 if not np.all(np.isfinite(values) | np.isnan(experiment.record[name].values)):
-                    raise ValueError(self._reason(place, name, params, where))
-        return predicted
+                    return place, name
+        return None
 
     def errors(self, params: Any, where: str) -> Errors:
         """What predictions are off.
 
         **Raises:** as `predict`.
         """
-        predicted = self.predict(params, where)
+        return self._errors(self.predict(params, where))
+
+    def _errors(self, predicted) -> Errors:
         measured = lambda i, name: np.asarray(self.experiments[i].record[name].values)
         values = self._rows(lambda i, name: predicted[i][name] - measured(i, name))
         missing = np.isnan(self._rows(measured))
@@ -188,6 +199,26 @@ class Laboratory(NamedTuple):
             found[name] = np.reshape(each, shape)
         return found
 
+    def first_noise(self, starts: Sequence[Any]) -> Noise:
+        """The noise at the likeliest of several parameters; those whose predictions are not finite do not count.
+
+        **Raises:** as `predict`, where that are all.
+        """
+        predicted = [self._predicted(params) for params in starts]
+        errors = [self._errors(each) for each in predicted if self._not_finite(each) is None]
+        errors = errors or [self.errors(starts[0], "where the fit starts")]
+        noises = [self.noise(each) for each in errors]
+        costs = [self._cost(*each) for each in zip(errors, noises, strict=True)]
+        return noises[int(np.argmin(costs))]
+
+    def _cost(self, errors, noise) -> float:
+        """Negative logarithm of the likelihood, but for a constant."""
+        deviations = self._deviations(noise)
+        u, squares = errors.values / deviations, 0.0
+        for group, (name, _) in enumerate(errors.names):
+            squares += float(np.sum(as_square(self.by_channel[name].loss, u[errors.of(group)]) ** 2))
+        return 0.5 * squares + float(np.sum(np.log(deviations[errors.there])))
+
     def lost(self, errors: Errors, noise: Noise, slopes: Float[np.ndarray, "m p"]) -> Float[np.ndarray, " n"]:
         """Of each row, the part of a measurement that parameters were fitted to, and that tells of no noise.
 
@@ -200,13 +231,7 @@ class Laboratory(NamedTuple):
 
     def _influences(self, errors, noise) -> "_Influences":
         """What the losses make of the rows."""
-        deviations = self._rows(
-            lambda i, name: np.broadcast_to(
-                noise[name] if self.sensors[i][name].noise is None else self.sensors[i][name].noise,
-                np.shape(self.experiments[i].record[name].values),
-            )
-        )
-        u, factors, silent = errors.values / deviations, np.ones_like(errors.values), []
+        u, factors, silent = errors.values / self._deviations(noise), np.ones_like(errors.values), []
         ratios = np.ones_like(u)
         for group, loss in self._robust(errors).items():
             rows = errors.of(group)
@@ -218,6 +243,15 @@ class Laboratory(NamedTuple):
                 factors[rows] = 0.0
                 silent.append(group)
         return _Influences(u, factors, ratios, silent)
+
+    def _deviations(self, noise) -> np.ndarray:
+        """Noise of all rows."""
+        return self._rows(
+            lambda i, name: np.broadcast_to(
+                noise[name] if self.sensors[i][name].noise is None else self.sensors[i][name].noise,
+                np.shape(self.experiments[i].record[name].values),
+            )
+        )
 
     def _robust(self, errors) -> dict[int, Loss]:
         """Groups whose loss is not that of squares, and theirs."""
