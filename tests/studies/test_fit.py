@@ -10,6 +10,7 @@ import optimistix as optx
 import pytest
 
 import linkax as lx
+from linkax.studies import fit_search
 
 TIMES = np.linspace(0.0, 4.0, 60)
 
@@ -139,6 +140,35 @@ def test_killed_and_resumed(tmp_path):
     for start, data in ((jax.tree.map(lambda x: 1.1 * x, START), args), (START, (measured(3),))):
         with pytest.raises(ValueError, match="their start or bounds, the data"):
             lx.fit(apart, start, data, checkpoint=file)
+
+
+def test_killed_while_it_searched_from_several_starts(tmp_path, monkeypatch):
+    """It goes on from the step at which it was killed; starts that have ended are not searched again."""
+    starts = {"size": np.array([1.0, 2.5, 1.0]), "rate": np.array([2.0, 0.9, np.inf])}
+    given = {"params": START, "args": (measured(2),), "starts": starts}
+    whole, save, saved = lx.fit(apart, **given), fit_search._Checkpoint.save, []
+
+    def counted(self, tree, **told):
+        save(self, tree, **told)
+        saved.append(self.path.name)
+        if saved == 4 * ["fit.starts.npz"]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(fit_search._Checkpoint, "save", counted)
+    with pytest.raises(KeyboardInterrupt):
+        lx.fit(apart, **given, checkpoint=tmp_path / "fit.npz")
+    assert [file.name for file in tmp_path.iterdir()] == ["fit.starts.npz"]
+    for more in (True, False):
+        before = len(saved)
+        rest = lx.fit(apart, **given, checkpoint=tmp_path / "fit.npz")
+        np.testing.assert_array_equal(rest.history["loss"], whole.history["loss"])
+        np.testing.assert_array_equal(rest.starts.losses, whole.starts.losses)
+        assert rest.starts.ended == whole.starts.ended
+        assert rest.ended == whole.ended
+        assert (len(saved) > before) == more  # a fit that has ended stays as it is
+    other = given | {"starts": jax.tree.map(lambda x: 1.01 * x, starts)}
+    with pytest.raises(ValueError, match="holds another fit"):
+        lx.fit(apart, **other, checkpoint=tmp_path / "fit.npz")
 
 
 def test_a_residual_by_reverse_mode_has_the_same_covariance():

@@ -18,6 +18,7 @@ from linkax.studies.fit_search import (
     Descent,
     Mode,
     Squares,
+    checkpoint_path,
     run_search,
     search_from_each,
     sensitivity,
@@ -85,7 +86,8 @@ def fit(
     - `patience`: number of steps without gain after which the fit ends; by default unlimited.
     - `mode`: "forward" or "reverse" mode of derivatives; by default forward for a residual, and for a loss the cheaper
       one by the number of parameters.
-    - `checkpoint`: a file, written at each step, from which the same fit goes on after it was killed or out of steps.
+    - `checkpoint`: a file, written at each step, from which the same fit goes on after it was killed or out of steps;
+      with `starts` a second one beside it keeps theirs, "fit.starts.npz" beside "fit.npz".
     - `progress`: whether to show a progress bar; by default where the output is a terminal.
     - `starts`: what `params` are, with plain numbers and one axis before theirs: the fit searches from each, computed
       as one batch, and goes on from the best; `params` are then no start. `Fit.starts` tells where the others led; one
@@ -116,7 +118,7 @@ def fit(
     steps = DEFAULT_STEPS["loss" if is_loss else "residual"] if steps is None else steps
     z, others = None, None
     if places is not None:
-        z, others = _best_start(search, places, data, steps, progress)
+        z, others = _best_start(search, places, data, steps, progress, checkpoint)
     z, losses, ended = run_search(search, data, steps, tolerance, patience, checkpoint, progress, z)
     if laboratory is not None and laboratory.finds_noise:
         again = lambda data, z, left: run_search(search, data, left, tolerance, patience, None, progress, z)
@@ -173,12 +175,16 @@ def _settled(again, search, laboratory, z, data, steps, losses, ended):
     return z, data, ended
 
 
-def _best_start(search, starts, data, steps, progress):
+def _best_start(search, starts, data, steps, progress, checkpoint):
     """The best of several searches, and where all led.
 
     **Raises:** `ValueError` where none can begin.
     """
-    every, losses, ended = search_from_each(search, starts, data, steps, progress)
+    beside = checkpoint
+    if checkpoint is not None:
+        path = checkpoint_path(checkpoint)
+        beside = path.with_name(f"{path.stem}.starts{path.suffix}")
+    every, losses, ended = search_from_each(search, starts, data, steps, progress, beside)
     if not np.any(np.isfinite(losses)):
         raise ValueError(f"the function is finite at none of {len(losses)} starts; give others")
     params = jax.tree.map(np.asarray, jax.vmap(search.free.params)(jnp.asarray(every)))

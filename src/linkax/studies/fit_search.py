@@ -173,14 +173,16 @@ def run_search(
     with compiling():
         found = search.evaluated(search.tried(z, None), args)
         state = _begin(search, z, found)
-    losses, best, best_z, waited = [], np.inf, z, 0
-    kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, state, args, found)
+    losses, best, best_z, waited, ended = [], np.inf, z, 0, None
+    programs = [(_step, (search, z, state, args, found))] + [(sensitivity, (search, z, args))] * bool(found)
+    kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, args, programs)
     if kept is not None and kept.path.exists():
-        (z, best_z, state), losses, waited = kept.load((z, best_z, state))
+        (z, best_z, state), told = kept.load((z, best_z, state))
+        losses, waited, ended = told["losses"], told["waited"], told["ended"]
         best, found = min(losses), None
-    ended = None
+    impatient = lambda: patience is not None and waited >= patience
     with Progress(steps, "step", progress) as line:
-        while ended is None and len(losses) < steps + 1:
+        while ended is None and not impatient() and len(losses) < steps + 1:
             before = z
             found = search.evaluated(search.tried(z, state), args) if found is None else found
             with compiling(not losses):
@@ -193,10 +195,10 @@ def run_search(
             waited = 0 if not np.isfinite(best) or loss < best - tolerance * abs(best) else waited + 1
             best, best_z = (loss, here) if loss <= best else (best, best_z)
             line.tell("fitting", len(losses), f", loss {loss:.6g}")
+            ended = _ending(loss, smooth, done)
             if kept is not None:
-                kept.save((z, best_z, state), losses, waited)
-            ended = _ending(loss, smooth, done, patience is not None and waited >= patience)
-    return best_z, losses, ended or "out of steps"
+                kept.save((z, best_z, state), losses=losses, waited=waited, ended=ended)
+    return best_z, losses, ended or ("stopped early" if impatient() else "out of steps")
 
 
 @eqx.filter_jit
@@ -222,44 +224,61 @@ def _step_each(search, z, state, args, found, active):
 
 
 def search_from_each(
-    search: AbstractSearch, starts: Float[Array, "n p"], args: tuple, steps: int, progress: bool | None
+    search: AbstractSearch,
+    starts: Float[Array, "n p"],
+    args: tuple,
+    steps: int,
+    progress: bool | None,
+    checkpoint: Path | None = None,
 ) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, " n"], list[str]]:
     """Search from several starts, computed together; one that fails harms no other.
 
     **Returns:** of each, the z of smallest loss, that loss, infinite where it could not begin, and how it ended.
+
+    **Raises:** `ValueError` for a checkpoint of other searches.
     """
-    z, ended = starts, [""] * len(starts)
+    z, ended, first = starts, [""] * len(starts), 0
     best_z, best = np.array(starts), np.full(len(starts), np.inf)
     with compiling():
         found = _evaluated_each(search, search.tried(z, None), args)
         state = _begin_each(search, z, found)
+    active = np.ones(len(starts), bool)
+    programs = [
+        (_evaluated_each, (search, z, args)),
+        (_step_each, (search, z, state, args, found, jnp.asarray(active))),
+    ]
+    kept = None if checkpoint is None else _Checkpoint.of(checkpoint, search, z, args, programs)
+    if kept is not None and kept.path.exists():
+        (z, state, *bests), told = kept.load((z, state, best_z, best))
+        (best_z, best), found = map(np.array, bests), None
+        ended, first = told["ended"], told["count"]
     with Progress(steps, "step", progress) as line:
-        for count in range(steps + 1):
+        for count in range(first, steps + 1):
             active = np.array([not reason for reason in ended])
             if not np.any(active):
                 break
             found = _evaluated_each(search, search.tried(z, state), args) if found is None else found
             before = z
-            with compiling(count == 0):
+            with compiling(count == first):
                 z, state, loss, smooth, done = _step_each(search, z, state, args, found, jnp.asarray(active))
             here, loss, found = np.asarray(z if isinstance(search, Squares) else before), np.asarray(loss), None
             better = active & (loss <= best)
             best[better], best_z[better] = loss[better], here[better]
             for i in np.flatnonzero(active):
-                ended[i] = _ending(loss[i], smooth[i], done[i], False) or ""
+                ended[i] = _ending(loss[i], smooth[i], done[i]) or "out of steps" * (count == steps)
             line.tell("searching", count, f", {np.sum(~active)} of {len(active)} done, best loss {np.min(best):.6g}")
-    return best_z, best, [reason or "out of steps" for reason in ended]
+            if kept is not None:
+                kept.save((z, state, best_z, best), ended=ended, count=count + 1)
+    return best_z, best, ended
 
 
-def _ending(loss, smooth, done, impatient) -> str | None:
+def _ending(loss, smooth, done) -> str | None:
     """How a search ends with this step, or None where it goes on."""
     if not np.isfinite(loss):
         return "diverged"
     if not smooth:
         return "no derivative"
-    if done:
-        return "converged"
-    return "stopped early" if impatient else None
+    return "converged" if done else None
 
 
 def _check_start(loss, smooth):
@@ -276,6 +295,11 @@ def _check_start(loss, smooth):
         )
 
 
+def checkpoint_path(path: str | os.PathLike) -> Path:
+    """Check the name of a file."""
+    return Path(require_type(path, str | os.PathLike, "checkpoint", "give the name of a file"))
+
+
 class _Checkpoint(NamedTuple):
     """A file with all that a search needs to go on.
 
@@ -288,31 +312,26 @@ class _Checkpoint(NamedTuple):
 
     @staticmethod
     def of(
-        path: str | os.PathLike,
-        search: AbstractSearch,
-        z: Float[Array, " p"],
-        state: Any,
-        args: tuple,
-        found: Evaluation,
+        path: str | os.PathLike, search: AbstractSearch, z: Float[Array, "..."], args: tuple, programs: list[tuple]
     ) -> "_Checkpoint":
-        path = Path(require_type(path, str | os.PathLike, "checkpoint", "give the name of a file"))
+        """**Arguments:** `programs`: those of the search, each with its arguments."""
+        path = checkpoint_path(path)
         writable_folder(path.parent, f"give another checkpoint than {str(path)!r}")
         if path.is_dir():
             raise ValueError(f"checkpoint {str(path)!r} is a folder; give the name of a file")
-        programs = [(_step, (search, z, state, args, found))] + [(sensitivity, (search, z, args))] * bool(found)
         text = "".join(cast(Any, program).lower(*given).as_text() for program, given in programs)
         numbers = jax.tree.leaves(eqx.filter((search, z, args), eqx.is_array))
         return _Checkpoint(path, search.free.names, fingerprint(text, numbers))
 
-    def save(self, tree: Any, losses: list[float], waited: int) -> None:
-        """Write the arrays of `tree`, the losses, and the number of steps that gained nothing."""
-        header = json.dumps({"names": self.names, "fit": self.fingerprint, "losses": losses, "waited": waited})
+    def save(self, tree: Any, **told: Any) -> None:
+        """Write the arrays of `tree`, and what else there is to tell, as JSON has it."""
+        header = json.dumps({"names": self.names, "fit": self.fingerprint, **told})
         leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array))
         arrays: dict[str, Any] = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
         with written_whole(self.path) as file, open(file, "wb") as stream:
             np.savez(stream, header=np.array(header), **arrays)
 
-    def load(self, like: Any) -> tuple[Any, list[float], int]:
+    def load(self, like: Any) -> tuple[Any, dict[str, Any]]:
         """Read what `save` wrote; `like` is a tree of the same structure.
 
         **Raises:** `ValueError` for a file of something else.
@@ -333,4 +352,4 @@ class _Checkpoint(NamedTuple):
                 "or remove this one"
             )
         stored = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(stored, leaves, strict=True)]
-        return eqx.combine(jax.tree.unflatten(structure, stored), static), header["losses"], header["waited"]
+        return eqx.combine(jax.tree.unflatten(structure, stored), static), header
