@@ -35,10 +35,18 @@ def test_angles_of_cut_joints_are_unwrapped():
     mechanism = lx.Mechanism([door], [hinge("upper", 1.0), hinge("lower", 0.0, cut=True)])
     turns = np.linspace(3.0, -9.0, 60)
     still = lx.Solution.of_state(mechanism, lx.State(np.zeros(1), np.zeros(1)))
-    solution = dataclasses.replace(still, ts=np.arange(60.0), q=turns[:, None], v=0.0 * turns[:, None])
+    speeds = np.full((60, 1), -12.0 / 59.0)
+    solution = dataclasses.replace(still, ts=np.arange(60.0), q=turns[:, None], v=speeds)
     assert np.ptp(np.asarray(solution.joint("lower"))) < 2.0 * np.pi
     np.testing.assert_allclose(lx.Encoder("lower").reading(solution), turns, atol=1e-12)
     np.testing.assert_allclose(lx.Encoder("upper").reading(solution), turns, atol=1e-12)
+    late = jnp.array([50.25, 37.5, 59.0, 12.0])  # a record that begins late, with more than half a turn between samples
+    exact = 3.0 - 12.0 / 59.0 * late
+    np.testing.assert_allclose(lx.Encoder("lower").predict(solution, late), exact, atol=1e-12)
+    record = lx.Experiment(lambda params: solution, {"angle": (late[1:3], late[1:3])}, {"angle": lx.Encoder("lower")})
+    np.testing.assert_allclose(record.predict({})["angle"], exact[1:3], atol=1e-12)
+    slope = jax.grad(lambda t: lx.Encoder("lower").predict(solution, t[None])[0])(late[1])
+    np.testing.assert_allclose(slope, -12.0 / 59.0, rtol=1e-9)
 
 
 def test_gain_bias_delay_and_components(solution):

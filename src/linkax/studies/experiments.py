@@ -100,7 +100,7 @@ def _predicted(experiment, params, sensors) -> dict[str, Array]:
     for name, sensor in sensors.items():
         own = slice(first, first := first + len(times[name]))
         part = dataclasses.replace(motion, ts=motion.ts[own], q=motion.q[own], v=motion.v[own])
-        found[name], values = sensor.told(part), experiment.record[name].values
+        found[name], values = sensor.told(part, solution), experiment.record[name].values
         if found[name].shape != values.shape:
             raise ValueError(
                 f"channel {name!r} has values of shape {values.shape}, and {type(sensor).__name__} tells "

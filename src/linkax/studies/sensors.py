@@ -8,7 +8,8 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jax import lax
+from jaxtyping import Bool, Float
 
 from linkax.model.forces import Gravity
 from linkax.model.joints.distance import Distance
@@ -92,13 +93,19 @@ class AbstractSensor(eqx.Module):
         """When the motion was as it is told at times `ts` [s], (n,)."""
         return ts - self.delay
 
-    def told(self, solution: Solution) -> Float[Array, "n_t ..."]:
-        """What this instrument tells of a solution at `times`, without noise; (n_t,) or (n_t, k).
+    def reading_between(self, motion: Solution, saved: Solution) -> Float[Array, "n_t ..."]:
+        """The same of a motion between the saved times of a solution, see `Solution.at`."""
+        return self.reading(motion)
+
+    def told(self, motion: Solution, saved: Solution | None = None) -> Float[Array, "n_t ..."]:
+        """What this instrument tells of a motion at `times`, without noise; (n_t,) or (n_t, k).
+
+        **Arguments:** `saved`: the solution that the motion was read from, where it is between saved times.
 
         **Raises:** `ValueError` for components that the reading does not have, and for gains, biases and noise that are
         neither one number nor one for each component.
         """
-        found = jnp.asarray(self.reading(solution))
+        found = jnp.asarray(self.reading(motion) if saved is None else self.reading_between(motion, saved))
         if self.components is not None:
             count = found.shape[1] if found.ndim == 2 else 0
             if np.max(self.components, initial=0) >= count:
@@ -119,14 +126,14 @@ class AbstractSensor(eqx.Module):
 
         **Raises:** `ValueError` as `Solution.at` and `told` do.
         """
-        return self.told(solution.at(self.times(jnp.asarray(real(ts, "times [s]")))))
+        return self.told(solution.at(self.times(jnp.asarray(real(ts, "times [s]")))), solution)
 
 
 class Encoder(AbstractSensor):
     """The coordinate of a joint, in the tree or cut [rad or m]; of several coordinates all.
 
-    The angle of a cut joint, which is known but for whole turns, is unwrapped from sample to sample; so must be the
-    measured one.
+    The angle of a cut joint is known but for whole turns. It is within half a turn of zero at the first saved time, and
+    does not jump from there on, with less than half a turn from one saved time to the next; nor must the measured one.
 
     **Arguments:** `joint`: its name. Others see `AbstractSensor`.
     """
@@ -134,11 +141,25 @@ class Encoder(AbstractSensor):
     joint: str = eqx.field(static=True)
 
     def reading(self, solution: Solution) -> Float[Array, "n_t ..."]:
-        found, joint = solution.joint(self.joint), solution.mechanism.joint(self.joint)
-        if self.joint in solution.mechanism.topology.coordinates or joint.has_quaternion:
+        found = solution.joint(self.joint)
+        if not np.any(wraps := self._wraps(solution, found)):
             return found
-        angle = np.array(joint.speed_units) == "rad"
-        return jnp.where(angle if found.ndim > 1 else angle[0], jnp.unwrap(found, axis=0), found)
+        return jnp.where(wraps, jnp.unwrap(found, axis=0), found)
+
+    def reading_between(self, motion: Solution, saved: Solution) -> Float[Array, "n_t ..."]:
+        found = motion.joint(self.joint)
+        if not np.any(wraps := self._wraps(motion, found)):
+            return found
+        before = jnp.maximum(jnp.searchsorted(saved.ts, motion.ts, side="right") - 1, 0)
+        turns = jnp.round((self.reading(saved)[before] - found) / (2.0 * jnp.pi))
+        return jnp.where(wraps, found + 2.0 * jnp.pi * lax.stop_gradient(turns), found)
+
+    def _wraps(self, solution, found) -> Bool[np.ndarray, "..."]:
+        """Whether each coordinate is known but for whole turns."""
+        joint = solution.mechanism.joint(self.joint)
+        if self.joint in solution.mechanism.topology.coordinates or joint.has_quaternion:
+            return np.zeros(found.shape[1:], bool)
+        return np.reshape(np.array(joint.speed_units) == "rad", found.shape[1:])
 
 
 class Tracker(AbstractSensor):
