@@ -1,5 +1,7 @@
 """Experiments: optima of textbooks, limits that hold, failed runs left aside, and one on a mechanism."""
 
+import dataclasses
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -84,6 +86,46 @@ def test_limits_that_nothing_meets_are_told():
     assert found.ended == "limits not met"
 
 
+def test_experiments_are_their_predictions_over_the_noise():
+    """As a function written by hand: without missing samples, and with 95 % of what is told through a robust loss."""
+    arm = lx.rod("arm", 1.0, 1.0)
+    mechanism = lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")])
+    still = lx.Solution.of_state(mechanism, lx.State(np.zeros(1), np.zeros(1)))
+    motion = dataclasses.replace(  # that turns evenly
+        still, ts=jnp.array([0.0, 9.0]), q=jnp.array([[0.3], [4.8]]), v=jnp.array([[0.5], [0.5]])
+    )
+
+    def sensors(params, design, own):
+        shared = {"bias": params["bias"], "delay": -design["wait"], "noise": 0.1 + 0.1 * design["range"]}
+        return {
+            "plain": lx.Encoder("hinge", gain=params["gain"], **shared),
+            "robust": lx.Encoder("hinge", gain=own * params["gain"], loss="huber", **shared),
+        }
+
+    ts, values = np.linspace(1.0, 4.0, 5), np.array([0.0, 0.0, np.nan, 0.0, 0.0])
+    channels = {"plain": (ts, values), "robust": (ts[:3], np.zeros(3))}
+    experiments = [lx.Experiment(lambda params, design, own: motion, channels, sensors, (own,)) for own in (1.0, 2.0)]
+
+    def by_hand(params, design):
+        angles = 0.3 + 0.5 * (ts + design["wait"])
+        told = lambda gain, angles: (gain * params["gain"] * angles + params["bias"]) / (0.1 + 0.1 * design["range"])
+        robust = [np.sqrt(0.95) * told(own, angles[:3]) for own in (1.0, 2.0)]
+        return [told(1.0, angles[np.isfinite(values)])] * 2 + robust
+
+    start = {"wait": lx.Bounded(2.0, 0.0, 4.0), "range": lx.Bounded(0.5, 0.0, 1.0)}
+    given = {"params": {"gain": 1.0, "bias": 1.0}, "design": start, "criterion": "A"}
+    found, expected = lx.design(experiments, **given), lx.design(by_hand, **given)
+    assert found.ended == expected.ended == "converged"
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance_before, expected.covariance_before, rtol=1e-9)
+    assert found.active == ["range, lower bound", "wait, lower bound"]
+    silent = lambda params, design, own: {"plain": lx.Encoder("hinge", delay=-design["wait"])}
+    with pytest.raises(ValueError, match="sensor of channel 'plain' has no noise, which a design needs; give it one"):
+        lx.design(lx.Experiment(experiments[0].model, channels, silent, (1.0,)), **given)
+    with pytest.raises(ValueError, match="an entry of the experiments is 1"):
+        lx.design([1.0], **given)
+
+
 TIMES = jnp.linspace(0.1, 1.0, 10)
 KNOTS = np.linspace(0.0, 1.0, 4)
 
@@ -163,6 +205,12 @@ def test_bad_designs_are_named(name):
     for value in BAD[name]:
         words = {"params": "param", "design": ""}.get(name, name)
         refused(lambda value=value: lx.design(**(GOOD | {name: value})), words)
+
+
+def test_what_is_known_beforehand_is_no_design():
+    for kind in (lx.Normal(0.0, 1.0), lx.LogNormal(1.0, 2.0)):
+        with pytest.raises(ValueError, match="design holds what has a prior, 'y', and a design is free; give a number"):
+            lx.design(**(GOOD | {"design": {"x": np.array([0.0, 1.0]), "y": kind}}))
 
 
 def test_what_the_first_design_does_not_determine_is_named():

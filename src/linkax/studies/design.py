@@ -12,8 +12,9 @@ from jaxtyping import Float
 
 from linkax.model.numbers import number, one_of, require, require_type, whole_number
 from linkax.studies.design_result import Design
+from linkax.studies.experiments import Experiment, Experiments, checked_experiments
 from linkax.studies.fit import check_output
-from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.free_parameters import FreeParameters, has_prior
 from linkax.studies.parameters import AbstractParameter, Bounded, Positive
 from linkax.studies.uncertainty import Scatter, uncertainty
 from linkax.xla.arrays import Array
@@ -46,6 +47,15 @@ class _Between(AbstractParameter):
 
     def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
         return self.lower + (self.upper - self.lower) * free
+
+
+class _Planned(eqx.Module):
+    """Predictions of experiments: (params, design) -> what `Experiment.planned` returns, for each."""
+
+    together: Experiments
+
+    def __call__(self, params: Any, design: Any) -> list[dict[str, Array]]:
+        return self.together.planned(params, design)
 
 
 class _Experiment(eqx.Module):
@@ -175,7 +185,7 @@ class _Search:
 
 
 def design(
-    predictions: Callable,
+    predictions: Callable | Experiment | Sequence[Experiment],
     params: Any,
     design: Any,
     *,
@@ -198,7 +208,8 @@ def design(
 
     - `predictions`: (params, design) -> what is measured, arrays in any pytree, each divided by the standard deviation
       of its noise. What is known of a parameter beforehand is one more prediction: the parameter over its standard
-      deviation.
+      deviation. Or a `linkax.Experiment`, or a list of them, whose model and sensors are functions of (params, design,
+      *args), and whose record says when they tell something.
     - `params`: pytree of numbers and arrays, the parameters as they are thought to be, as for `linkax.fit`. Standard
       errors are relative to them; to one, for a parameter that is zero.
     - `design`: pytree of numbers and arrays, where the search starts; `linkax.Bounded` and `linkax.Positive` among them
@@ -215,12 +226,16 @@ def design(
 
     **Returns:** a `Design`, the best one that meets the limits. Designs whose run fails are left aside.
 
-    **Raises:** `ValueError` for params and designs that are not numbers, for predictions and limits that are none or
-    are not finite where the search starts, and for parameters that the first design does not determine, by name.
+    **Raises:** `ValueError` for params and designs that are not numbers, or have a prior, for sensors without noise,
+    for predictions and limits that are none or are not finite where the search starts, and for parameters that the
+    first design does not determine, by name.
 
     **Warns:** where the search ended in no optimum, and where no design met the limits.
     """
-    require_type(predictions, Callable, "predictions", "give a function of (params, design)")
+    kinds = Callable | Experiment | list | tuple
+    require_type(predictions, kinds, "predictions", "give a function of (params, design), or experiments")
+    if not callable(predictions):
+        predictions = _Planned(Experiments.of(checked_experiments(predictions)))
     if limits is not None:
         require_type(limits, Callable, "limits", "give a function of (params, design), or None")
     one_of(criterion, CRITERIA, "criterion")
@@ -233,6 +248,12 @@ def design(
         raise ValueError(f"params hold a parameter with a prior, {', '.join(map(repr, free.names))}; {told}")
     boxed = lambda leaf: _Between(leaf.value, leaf.lower, leaf.upper)
     choices = FreeParameters.of(_replaced(design, boxed, Bounded))
+    if choices.num_priors:
+        given = [name for name, leaf in zip(choices.leaf_names, choices.leaves, strict=True) if has_prior(leaf)]
+        raise ValueError(
+            f"design holds what has a prior, {', '.join(map(repr, given))}, and a design is free; give a number, or "
+            "linkax.Bounded"
+        )
     matters = _chosen(of, free)
     experiment = _Experiment(predictions, limits, free, choices)
     names = _checked_outputs(experiment)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from linkax.model.numbers import require_type
 from linkax.simulation.read.solution import Solution
-from linkax.studies.losses import as_square
+from linkax.studies.losses import EFFICIENCY, as_square
 from linkax.studies.parameters import as_arrays
 from linkax.studies.records import Record
 from linkax.studies.sensors import AbstractSensor
@@ -38,6 +38,9 @@ class Experiment(eqx.Module):
     - `args`: further arguments of model and sensors, numbers and arrays that are this experiment's own: a measured
       load, or the index of its initial state among the parameters. Experiments with the same model and sensors, and
       records of the same shapes, are computed as one batch.
+
+    For `linkax.design`, model and sensors get the design as one more argument, (params, design, *args), all sensors
+    have a noise, and of the values of the record only those that are missing count.
 
     **Raises:** `ValueError` for arguments of other kinds, and a sensor without channel.
     """
@@ -91,6 +94,23 @@ class Experiment(eqx.Module):
             rows[name] = as_square(sensor.loss, apart / (noise[name] if sensor.noise is None else sensor.noise))
         return rows
 
+    def planned(self, params: Any, design: Any) -> dict[str, Float[Array, "n ..."]]:
+        """What `linkax.design` gets, by channel: predictions over the noise; zero where a sample is missing.
+
+        Where errors are normal, a robust loss leaves 95 % of what measurements tell.
+
+        **Raises:** `ValueError` for a sensor without noise.
+        """
+        own = dataclasses.replace(self, args=(design, *self.args))
+        # Information is that of the mean: noise that depends on parameters tells nothing of them here.
+        rows, of_noise = {}, own.sensors_at(jax.lax.stop_gradient(params))
+        for name, predicted in _predicted(own, params, own.sensors_at(params)).items():
+            noise, share = of_noise[name].noise, EFFICIENCY[of_noise[name].loss]
+            if noise is None:
+                raise ValueError(f"the sensor of channel {name!r} has no noise, which a design needs; give it one")
+            rows[name] = jnp.where(jnp.isnan(self.record[name].values), 0.0, np.sqrt(share) * predicted / noise)
+        return rows
+
 
 def _predicted(experiment, params, sensors) -> dict[str, Array]:
     solution = experiment.model(params, *experiment.args)
@@ -120,7 +140,7 @@ class Experiments(eqx.Module):
 
     @staticmethod
     def of(experiments: Sequence[Experiment]) -> "Experiments":
-        """Put those of a kind together."""
+        """Put those of a kind together, which `checked_experiments` has checked."""
         kinds: dict[int, list[int]] = {}
         for place, experiment in enumerate(experiments):
             alike = next((first for first in kinds if _are_alike(experiments[first], experiment)), place)
@@ -145,6 +165,24 @@ class Experiments(eqx.Module):
     def predict(self, params: Any) -> list[dict[str, Array]]:
         """Of each experiment, see `Experiment.predict`."""
         return self._of_each(lambda experiment: experiment.predict(params))
+
+    def planned(self, params: Any, design: Any) -> list[dict[str, Array]]:
+        """Of each experiment, see `Experiment.planned`."""
+        return self._of_each(lambda experiment: experiment.planned(params, design))
+
+
+def checked_experiments(experiments: Experiment | Sequence[Experiment]) -> list[Experiment]:
+    """One experiment or several as a list.
+
+    **Raises:** `ValueError` for entries that are no experiments, and where there are none.
+    """
+    remedy = "give linkax.Experiment(model, record, sensors)"
+    found = [experiments] if isinstance(experiments, Experiment) else list(experiments)
+    for each in found:
+        require_type(each, Experiment, "an entry of the experiments", remedy)
+    if not found:
+        raise ValueError(f"there are no experiments in the list; {remedy}")
+    return found
 
 
 def _are_alike(one, other) -> bool:

@@ -9,8 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, Int
 
-from linkax.model.numbers import require_type
-from linkax.studies.experiments import Experiment, Experiments, Noise, predict
+from linkax.studies.experiments import Experiment, Experiments, Noise, checked_experiments, predict
 from linkax.studies.losses import Loss, as_square, influence, spread
 from linkax.studies.sensors import AbstractSensor
 from linkax.studies.uncertainty import Scatter, leverages
@@ -69,13 +68,7 @@ class Laboratory(NamedTuple):
 
         **Raises:** `ValueError` for entries that are no experiments, and where the noise of a sensor is a parameter.
         """
-        found = [experiments] if isinstance(experiments, Experiment) else list(experiments)
-        for each in found:
-            require_type(
-                each, Experiment, "an entry of the experiments", "give linkax.Experiment(model, record, sensors)"
-            )
-        if not found:
-            raise ValueError("there are no experiments in the list; give linkax.Experiment(model, record, sensors)")
+        found = checked_experiments(experiments)
         for each in filter(lambda each: callable(each.sensors), found):
             jax.eval_shape(partial(_check_noise, each), params)
         return Laboratory(found, Experiments.of(found), [each.sensors_at(params) for each in found])

@@ -11,9 +11,10 @@ from linkax.xla.arrays import Array
 
 Loss = Literal["squares", "huber", "cauchy"]
 LOSSES = get_args(Loss)
-# Residuals in units of the noise from which they count less: where errors are normal, estimates are as sure as 95 % of
-# the measurements make those of least squares.
+# Residuals in units of the noise from which they count less: where errors are normal, estimates are as sure as a share
+# of the measurements, EFFICIENCY, makes those of least squares.
 FROM = {"huber": 1.345, "cauchy": 2.385}
+EFFICIENCY = {"squares": 1.0, "huber": 0.95, "cauchy": 0.95}
 NORMAL = 1.4826  # standard deviation of a normal error, over the median of its magnitude
 SMALL = 1e-4
 
