@@ -181,6 +181,15 @@ def test_a_residual_of_one_entry_is_squared():
     np.testing.assert_allclose(found.params["x"], 3.0, atol=1e-4)
 
 
+def test_a_fit_without_noise_says_so(tmp_path):
+    """Of data that are exact, and of as many numbers as data; not of one with noise."""
+    line, told = lambda p, data: p["a"] + p["b"] * TIMES[: len(data)] - data, "standard errors tell of no noise"
+    exact = 3.0 + 2.0 * TIMES
+    fits = [lx.fit(line, {"a": 1.0, "b": 1.0}, (data,)) for data in (exact, exact[:2], exact + np.sin(9.0 * TIMES))]
+    assert [told in str(found) for found in fits] == [True, True, False]
+    assert told in fits[0].report(tmp_path / "fit.html").read_text()
+
+
 def test_patience_with_losses_below_zero():
     found = lx.fit(lambda p: -1.0 + 0.0 * p["x"], {"x": 1.0}, patience=5)
     assert (found.ended, found.steps) == ("stopped early", 5)

@@ -14,7 +14,7 @@ from linkax.files import writable_folder, written_whole
 from linkax.plot.figure import Figure
 from linkax.scenery.colours import BLUE, FAINT, INK, VERMILION, body_colour
 from linkax.studies.experiments import Experiment
-from linkax.studies.fit_result import Fit
+from linkax.studies.fit_result import EXACT, Fit, is_exact
 from linkax.studies.losses import Loss, influence
 from linkax.studies.whiteness import Whiteness
 from linkax.tables import count, numbers
@@ -83,7 +83,7 @@ def _summary(fit) -> str:
             if fit.experiments
             else f"noise {numbers(fit.noise)}"
         )
-    return f"<p>{escape('; '.join(facts))}</p>"
+    return f"<p>{escape('; '.join(facts + [EXACT] * is_exact(fit)))}</p>"
 
 
 def _flat(tree) -> np.ndarray:

@@ -17,10 +17,19 @@ from linkax.studies.uncertainty import Spread
 from linkax.tables import Rows, Table, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
 
+ROUNDING = 1e-9  # standard error of a number relative to its start, up to which no measurement can be meant
+EXACT = "exact but for rounding, so that standard errors tell of no noise"
+
+
+def is_exact(fit: "Fit") -> bool:
+    """Whether a residual is but rounding: that of data without noise, or of no more data than numbers."""
+    return fit.spread is not None and bool(np.all(fit.spread.deviation <= ROUNDING))
+
 
 def _table(fit: "Fit") -> Table:
     title = f"Fit: {fit.ended} after {count(fit.steps, 'step')}, loss {numbers(fit.loss)}"
     title += "" if fit.noise is None else f", noise {numbers(fit.noise)}"
+    title += f"; {EXACT}" if is_exact(fit) else ""
     values = np.concatenate([np.ravel(known(leaf)) for leaf in jax.tree.leaves(fit.params)])
     spreads = [None] * len(values) if fit.covariance is None else np.sqrt(np.diagonal(np.asarray(fit.covariance)))
     rows = [
@@ -111,8 +120,8 @@ class Fit(NamedTuple):
     def sample(self, key: Array, count: int) -> Any:
         """Draw parameters from Laplace's approximation of their posterior, for predictions with their uncertainty.
 
-        The free numbers are normal about the fit, with its covariance, as from a flat prior in them; so draws stay
-        within the bounds of `Positive` and `Bounded`.
+        The free numbers are normal about the fit, with its covariance, as from their priors, which are flat but for
+        those of `Normal` and `LogNormal`; so draws stay within the bounds of `Positive` and `Bounded`.
 
         **Arguments:** `key`: of `jax.random`. `count`: number of draws.
 
