@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import mechanisms
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import linkax as lx
 from benchmarks.kinematics import LENGTHS, four_bar, rocker_angle
+from linkax.analysis.course import _spline
 
 UP = {"D": 1.5}
 TURN = np.linspace(0.0, 2.0 * np.pi, 101)
@@ -169,6 +171,21 @@ def test_cut_joints_and_places(linkage, turn):
     ):
         found = lx.trace(mechanism, turn.state(8), along)
         np.testing.assert_allclose(found.joint("A"), TURN[part], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 60])
+def test_values_are_joined_by_the_spline_of_scipy(count):
+    """Of several, and its derivatives by the values in both modes."""
+    values, places = np.random.default_rng(count).normal(size=(count, 3)), np.arange(count)
+    exact, of_each = CubicSpline(places, values), CubicSpline(places, np.eye(count))
+    of_one = lambda values: _spline(values[:, :1])
+    found, *modes = jax.jit(lambda values: (_spline(values), jax.jacfwd(of_one)(values), jax.jacrev(of_one)(values)))(
+        values
+    )
+    for order in range(2):
+        np.testing.assert_allclose(found[order], exact(places, order + 1), rtol=0.0, atol=1e-13)
+        for mode in modes:
+            np.testing.assert_allclose(mode[order][:, 0, :, 0], of_each(places, order + 1), rtol=0.0, atol=1e-13)
 
 
 @pytest.mark.slow
