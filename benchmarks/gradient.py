@@ -1,8 +1,9 @@
 """A derivative through a simulation: the crank of M1n after one second by the mass of its rod, whose inertia grows too.
 
-linkax backwards and forwards, against MuJoCo's central difference of two runs, and MJX forwards. Each row: the
-derivative [rad/kg], milliseconds that it takes after compilation, and that the run alone takes, and seconds to compile
-where that is known. Peers at a step of 1e-3 s, as the row says. Times are of this machine, this run: compare ratios.
+linkax backwards and forwards, alone and in a batch, against MuJoCo's central difference of two runs, and MJX forwards.
+Each row: the derivative [rad/kg], milliseconds that it takes after compilation, and that the run alone takes, and
+seconds to compile where that is known. Peers at a step of 1e-3 s, as the row says. Times are of this machine, this run:
+compare ratios.
 """
 
 import time
@@ -26,6 +27,7 @@ MASS, DURATION = 1.0, 1.0
 ACCURACY = lx.Accuracy(rtol=1e-7)
 TIMES = np.linspace(0.0, DURATION, 21)
 DIFFERENCE = 1e-4  # kg
+MEMBERS = 80
 
 
 def _mechanism(mass):
@@ -40,23 +42,45 @@ def by_linkax() -> Iterator[dict]:
     """In both modes."""
     _, state = PROBLEM.start()
 
-    def angle(mass):
-        saveat = diffrax.SaveAt(t1=True)
-        found = lx.simulate(_mechanism(mass), state, t1=DURATION, accuracy=ACCURACY, saveat=saveat)
-        return found.joint("bearing")[-1]
-
-    mass = jnp.array(MASS)
-    run = jax.jit(angle).lower(mass).compile()
-    run(mass)
-    _, alone = timed(lambda: jax.block_until_ready(run(mass)))
+    angle, mass = _angle(state), jnp.array(MASS)
+    _, alone, _ = _timed(angle, mass)
     for mode, transformed in (("backwards", jax.value_and_grad(angle)), ("forwards", _forwards(angle))):
-        began = time.perf_counter()
-        program = jax.jit(transformed).lower(mass).compile()
-        compiling = time.perf_counter() - began
-        program(mass)
-        (_, slope), seconds = timed(lambda program=program: jax.block_until_ready(program(mass)))
+        (_, slope), seconds, compiling = _timed(transformed, mass)
         told = {"by": "linkax", "mode": mode, "derivative": float(slope), "ms": 1e3 * seconds}
         yield {**told, "run_ms": 1e3 * alone, "compile_s": compiling}
+
+
+def of_a_batch() -> Iterator[dict]:
+    """80 members, with room for all steps that a run may take, and with less."""
+    _, state = PROBLEM.start()
+    masses = jnp.linspace(0.9 * MASS, 1.1 * MASS, MEMBERS)
+    for options in ({}, {"max_steps": 1000}):
+        angle = _angle(state, **options)
+        _, alone, _ = _timed(jax.vmap(angle), masses)
+        for mode, transformed in (("backwards", jax.value_and_grad(angle)), ("forwards", _forwards(angle))):
+            _, seconds, compiling = _timed(jax.vmap(transformed), masses)
+            told = {"by": f"linkax, {MEMBERS} members", "mode": mode, **options, "ms": 1e3 * seconds}
+            yield {**told, "run_ms": 1e3 * alone, "compile_s": compiling}
+
+
+def _angle(state, **options):
+    """The crank's angle at the end, as a function of the rod's mass."""
+
+    def angle(mass):
+        saveat = diffrax.SaveAt(t1=True)
+        found = lx.simulate(_mechanism(mass), state, t1=DURATION, accuracy=ACCURACY, saveat=saveat, **options)
+        return found.joint("bearing")[-1]
+
+    return angle
+
+
+def _timed(function, mass):
+    """Value, seconds of a run, and seconds to compile it."""
+    began = time.perf_counter()
+    program = jax.jit(function).lower(mass).compile()
+    compiling = time.perf_counter() - began
+    program(mass)
+    return *timed(lambda: jax.block_until_ready(program(mass))), compiling
 
 
 def _forwards(function):
@@ -94,4 +118,4 @@ def _bearing(description):
 
 
 if __name__ == "__main__":
-    print_parts(__doc__, {"linkax": by_linkax, "mujoco": by_mujoco, "mjx": by_mjx})
+    print_parts(__doc__, {"linkax": by_linkax, "batch": of_a_batch, "mujoco": by_mujoco, "mjx": by_mjx})
