@@ -63,8 +63,8 @@ def lost(members, _):
 
     import linkax as lx
     from benchmarks.sweep import member
-    from linkax.studies.sweep_result import NOT_RUN
-    from linkax.studies.sweep_store import SweepStore
+    from linkax.studies.sweeps.sweep_result import NOT_RUN
+    from linkax.studies.sweeps.sweep_store import SweepStore
 
     class Who(SchedulerPlugin):
         """Counts chunks by the workers that computed them."""
@@ -131,10 +131,10 @@ def overhead(members, rounds):
     import psutil
 
     from benchmarks.sweep import member
-    from linkax.studies.sweep import DEFAULT_CHUNK, DEFAULT_MEMORY
-    from linkax.studies.sweep_program import Plan, SweepProgram, is_struct
-    from linkax.studies.sweep_run import Threads, Workers, run_sweep
-    from linkax.studies.sweep_workers import Work
+    from linkax.studies.sweeps.sweep import DEFAULT_CHUNK, DEFAULT_MEMORY
+    from linkax.studies.sweeps.sweep_program import Plan, SweepProgram, is_struct
+    from linkax.studies.sweeps.sweep_run import Threads, Workers, run_sweep
+    from linkax.studies.sweeps.sweep_workers import Work
     from linkax.xla.waiting import Progress
 
     given = params(members)

@@ -32,7 +32,7 @@ from linkax import plot
 from linkax.scenery.colours import BLUE, GREEN, VERMILION
 from linkax.scenes import SCENES
 from linkax.simulation.simulate import fixed_steps
-from linkax.studies.comparison import Stepping, compare
+from linkax.studies.sweeps.comparison import Stepping, compare
 
 COLOURS = (BLUE, VERMILION, GREEN)
 # The paper's names, and its verdicts from α₁ = π/2 and α₁ = 0.

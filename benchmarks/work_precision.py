@@ -30,7 +30,7 @@ from benchmarks.peers.__main__ import rows as peer_rows
 from benchmarks.peers.runs import timed
 from benchmarks.problems import PROBLEMS, TIMES, add_problems, chosen
 from linkax.files import written_whole
-from linkax.studies.comparison import evaluations
+from linkax.studies.sweeps.comparison import evaluations
 
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 SINGLE = 1e-6  # smallest tolerance in single precision

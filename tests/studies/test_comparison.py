@@ -1,6 +1,6 @@
 """What `linkax compare` chooses from what it has measured."""
 
-from linkax.studies.comparison import Trial, at_equal_cost
+from linkax.studies.sweeps.comparison import Trial, at_equal_cost
 
 
 def trial(formulation, rtol, error, run_s, verdict="converged"):

@@ -10,7 +10,7 @@ import optimistix as optx
 import pytest
 
 import linkax as lx
-from linkax.studies import fit_search
+from linkax.studies.fits import fit_search
 
 TIMES = np.linspace(0.0, 4.0, 60)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import linkax as lx
-from linkax.studies.experiments import Experiments
-from linkax.studies.losses import as_square, influence
+from linkax.studies.laboratory.experiments import Experiments
+from linkax.studies.laboratory.losses import as_square, influence
 
 TIMES = np.arange(0.1, 1.9, 0.02)
 TRUTH = {"gain": 1.05, "bias": 0.2, "delay": 0.013}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import linkax as lx
-from linkax.studies.whiteness import Whiteness
+from linkax.studies.laboratory.whiteness import Whiteness
 
 TIMES = np.linspace(0.0, 4.0, 120)
 

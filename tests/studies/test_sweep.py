@@ -16,7 +16,7 @@ import zarr
 from studies import sweep_job
 
 import linkax as lx
-from linkax.studies.sweep_result import REASONS
+from linkax.studies.sweeps.sweep_result import REASONS
 
 JOB = Path(sweep_job.__file__)
 

@@ -17,8 +17,8 @@ import pytest
 from refusals import refused
 
 import linkax as lx
-from linkax.studies.sweep_program import SweepProgram
-from linkax.studies.sweep_store import LABELLED, SweepStore
+from linkax.studies.sweeps.sweep_program import SweepProgram
+from linkax.studies.sweeps.sweep_store import LABELLED, SweepStore
 
 MEMBERS, CHUNK = 10, 4  # the last chunk has two
 PARAMS = {"a": np.linspace(0.1, 1.0, MEMBERS)}

@@ -20,8 +20,8 @@ from refusals import refused
 from studies import sweep_job
 
 import linkax as lx
-from linkax.studies.sweep_run import TRIES
-from linkax.studies.sweep_workers import Refusal, Work, plan_sweep, sweep_chunk
+from linkax.studies.sweeps.sweep_run import TRIES
+from linkax.studies.sweeps.sweep_workers import Refusal, Work, plan_sweep, sweep_chunk
 
 LIMIT = 120.0  # seconds
 FREE = 10  # tasks that run before the gate opens

@@ -20,8 +20,8 @@ from linkax.cli.report import finite
 from linkax.files import written_whole
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.formulations.named import COMPARED, TANGENT_SPACE, formulation
-from linkax.studies.comparison import TIGHTEST, Stepping, at_equal_cost, compare
-from linkax.studies.comparison_result import Comparison, Trial
+from linkax.studies.sweeps.comparison import TIGHTEST, Stepping, at_equal_cost, compare
+from linkax.studies.sweeps.comparison_result import Comparison, Trial
 
 LADDER = (1e2, 1e1, 1.0, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances to choose from at equal cost, relative to --rtol
 STEP_LADDER = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # steps likewise, relative to --dt

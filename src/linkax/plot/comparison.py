@@ -3,7 +3,7 @@
 from linkax.formulations.named import TANGENT_SPACE
 from linkax.plot.figure import Figure
 from linkax.scenery.colours import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION
-from linkax.studies.comparison_result import Comparison
+from linkax.studies.sweeps.comparison_result import Comparison
 
 COLOURS = (VERMILION, GREEN, ORANGE, PURPLE, SKY, INK, FAINT)
 MARKERS = {"": "o", "baumgarte": "s", "partitioning": "^", "projection": "D"}

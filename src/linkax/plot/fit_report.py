@@ -13,10 +13,10 @@ from jaxtyping import Float
 from linkax.files import writable_folder, written_whole
 from linkax.plot.figure import Figure
 from linkax.scenery.colours import BLUE, FAINT, INK, VERMILION, body_colour
-from linkax.studies.experiments import Experiment
-from linkax.studies.fit_result import EXACT, Fit, is_exact
-from linkax.studies.losses import Loss, influence
-from linkax.studies.whiteness import Whiteness
+from linkax.studies.fits.fit_result import EXACT, Fit, is_exact
+from linkax.studies.laboratory.experiments import Experiment
+from linkax.studies.laboratory.losses import Loss, influence
+from linkax.studies.laboratory.whiteness import Whiteness
 from linkax.tables import count, numbers
 
 MOST_POINTS = 2000  # that a picture draws one by one; of more it is made of pixels

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from linkax.files import synced, writable_folder, written_whole
-from linkax.studies.fingerprint import fingerprint
-from linkax.studies.paths import path_parts
-from linkax.studies.sweep_program import Plan
+from linkax.studies.parameters.fingerprint import fingerprint
+from linkax.studies.parameters.paths import path_parts
+from linkax.studies.sweeps.sweep_program import Plan
 from linkax.xla.users_line import warn
 
 FORMAT = 2

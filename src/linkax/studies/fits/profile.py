@@ -11,13 +11,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float
 
 from linkax.model.numbers import is_finite, number, real, require, require_type, whole_number
-from linkax.studies.experiments import Experiment
-from linkax.studies.fit_result import Fit
-from linkax.studies.fit_search import Squares, search_from_each, sensitivity
-from linkax.studies.laboratory import Laboratory
-from linkax.studies.levenberg_marquardt import LevenbergMarquardt
-from linkax.studies.parameters import as_arrays
-from linkax.studies.profile_result import Profile
+from linkax.studies.fits.fit_result import Fit
+from linkax.studies.fits.fit_search import Squares, search_from_each, sensitivity
+from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt
+from linkax.studies.fits.profile_result import Profile
+from linkax.studies.laboratory.experiments import Experiment
+from linkax.studies.laboratory.laboratory import Laboratory
+from linkax.studies.parameters.parameters import as_arrays
 from linkax.tables import one
 from linkax.xla.arrays import Array
 from linkax.xla.users_line import warn

@@ -12,11 +12,11 @@ from jaxtyping import Float
 from linkax.analysis.trace import Trace
 from linkax.model.numbers import number, require, require_bool, require_type, whole_number
 from linkax.simulation.integrate.results import RESULTS
-from linkax.studies.fit_search import Squares, search_from_each
-from linkax.studies.free_parameters import FreeParameters
-from linkax.studies.levenberg_marquardt import LevenbergMarquardt
-from linkax.studies.parameters import Bounded
-from linkax.studies.synthesis_result import Candidate, Synthesis
+from linkax.studies.fits.fit_search import Squares, search_from_each
+from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt
+from linkax.studies.parameters.free_parameters import FreeParameters
+from linkax.studies.parameters.parameters import Bounded
+from linkax.studies.synthesis.synthesis_result import Candidate, Synthesis
 from linkax.xla.arrays import Array
 from linkax.xla.waiting import compiling
 

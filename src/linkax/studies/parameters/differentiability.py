@@ -20,7 +20,7 @@ from linkax.model.numbers import require_type
 from linkax.simulation.integrate.results import ENDED_WELL, result_name
 from linkax.simulation.read.passages import singular_states
 from linkax.simulation.read.solution import Solution
-from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.parameters.free_parameters import FreeParameters
 
 DEPENDENT = 1e-4  # singular value of J [rad, lengths of the mechanism] up to which a row depends on others
 OPENS = 1e-3  # part of a change of the loops, relative to it, from which it counts as one that no motion closes

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float
 
 from linkax.files import writable_folder, written_whole
 from linkax.model.numbers import require_type
-from linkax.studies.fingerprint import fingerprint
-from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.parameters.fingerprint import fingerprint
+from linkax.studies.parameters.free_parameters import FreeParameters
 from linkax.xla.arrays import Array
 from linkax.xla.waiting import Progress, compiling
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, cast
 import jax
 import numpy as np
 
-from linkax.studies.sweep_program import SweepProgram
+from linkax.studies.sweeps.sweep_program import SweepProgram
 from linkax.xla.program_cache import cache_programs
 
 MOST_PROGRAMS = 8  # that a worker keeps

@@ -13,9 +13,9 @@ from jaxtyping import ArrayLike
 from linkax.model.numbers import require_bool, require_type, whole_number
 from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS
 from linkax.simulation.read.solution import Solution
-from linkax.studies.deviations import Deviations
-from linkax.studies.sweep import sweep
-from linkax.studies.tolerance_result import (
+from linkax.studies.sweeps.sweep import sweep
+from linkax.studies.tolerances.deviations import Deviations
+from linkax.studies.tolerances.tolerance_result import (
     SobolIndices,
     Statistics,
     ToleranceAnalysis,

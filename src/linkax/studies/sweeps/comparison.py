@@ -27,7 +27,7 @@ from linkax.simulation.read.solution import Solution
 from linkax.simulation.simulate import fixed_steps, simulate
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time
-from linkax.studies.comparison_result import Comparison, Trial
+from linkax.studies.sweeps.comparison_result import Comparison, Trial
 
 TIGHTEST, NEXT_TO_IT = 1e-13, 1e-12  # tolerances of the reference run and of the run that checks it
 DIVERGED = 1e-2  # default bound of the error, in lengths of the mechanism

@@ -26,7 +26,7 @@ from linkax.model.numbers import (
 )
 from linkax.simulation.read.by_name import BodyPoint
 from linkax.simulation.read.solution import Solution
-from linkax.studies.losses import LOSSES, Loss
+from linkax.studies.laboratory.losses import LOSSES, Loss
 from linkax.xla.arrays import Array
 
 

@@ -12,10 +12,10 @@ from jaxtyping import Float
 
 from linkax.model.numbers import require_type
 from linkax.simulation.read.solution import Solution
-from linkax.studies.losses import EFFICIENCY, as_square
-from linkax.studies.parameters import as_arrays
-from linkax.studies.records import Record
-from linkax.studies.sensors import AbstractSensor
+from linkax.studies.laboratory.losses import EFFICIENCY, as_square
+from linkax.studies.laboratory.records import Record
+from linkax.studies.laboratory.sensors import AbstractSensor
+from linkax.studies.parameters.parameters import as_arrays
 from linkax.xla.arrays import Array
 
 Noise = dict[str, Float[Array, "..."]]

@@ -16,12 +16,12 @@ from jaxtyping import ArrayLike
 from linkax.model.numbers import real, require_type, whole_number
 from linkax.simulation.integrate.results import REMARKS, WARNINGS
 from linkax.simulation.read.solution import Solution
-from linkax.studies.parameters import as_arrays
-from linkax.studies.sweep_program import Plan, SweepProgram, is_struct
-from linkax.studies.sweep_result import NOT_RUN, Sweep
-from linkax.studies.sweep_run import Threads, Workers, run_sweep
-from linkax.studies.sweep_store import SweepStore
-from linkax.studies.sweep_workers import Work, check_executor
+from linkax.studies.parameters.parameters import as_arrays
+from linkax.studies.sweeps.sweep_program import Plan, SweepProgram, is_struct
+from linkax.studies.sweeps.sweep_result import NOT_RUN, Sweep
+from linkax.studies.sweeps.sweep_run import Threads, Workers, run_sweep
+from linkax.studies.sweeps.sweep_store import SweepStore
+from linkax.studies.sweeps.sweep_workers import Work, check_executor
 from linkax.xla.enumerations import code, is_item, item
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import Progress, compiling

@@ -42,7 +42,7 @@ class Sweep(NamedTuple):
 
     - `output`: as the function returns it, arrays with a leading axis of members; where a member failed, what it had
       computed until then.
-    - `reasons`: how each member ended, as an index into `linkax.studies.sweep_result.REASONS`, (n,).
+    - `reasons`: how each member ended, as an index into `linkax.studies.sweeps.sweep_result.REASONS`, (n,).
     - `seconds_per_member`: wall time without compilation, but for that of an executor's later workers [s]; NaN where a
       store held all members already.
     - `remarks`: a `linkax.REMARKS` of each member, (n,): what a single run would warn of. Known where the function

@@ -11,8 +11,8 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from linkax.simulation.integrate.results import KNOWN_RESULTS, RESULTS
-from linkax.studies.fingerprint import fingerprint
-from linkax.studies.sweep_result import FINE, NOT_FINITE_OUTPUT, REASONS
+from linkax.studies.parameters.fingerprint import fingerprint
+from linkax.studies.sweeps.sweep_result import FINE, NOT_FINITE_OUTPUT, REASONS
 from linkax.xla.enumerations import code, is_item
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from linkax.model.numbers import is_finite, number, real, require
-from linkax.studies.free_parameters import FreeParameters
-from linkax.studies.parameters import AbstractParameter, as_arrays
-from linkax.studies.paths import path_parts
+from linkax.studies.parameters.free_parameters import FreeParameters
+from linkax.studies.parameters.parameters import AbstractParameter, as_arrays
+from linkax.studies.parameters.paths import path_parts
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import all_concrete, concrete
 

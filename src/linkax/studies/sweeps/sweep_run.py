@@ -13,10 +13,10 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from linkax.studies.sweep_program import Plan, SweepProgram
-from linkax.studies.sweep_result import FINE, NOT_RUN
-from linkax.studies.sweep_store import SweepStore
-from linkax.studies.sweep_workers import Refusal, Work, as_leaves, plan_sweep, sweep_chunk
+from linkax.studies.sweeps.sweep_program import Plan, SweepProgram
+from linkax.studies.sweeps.sweep_result import FINE, NOT_RUN
+from linkax.studies.sweeps.sweep_store import SweepStore
+from linkax.studies.sweeps.sweep_workers import Refusal, Work, as_leaves, plan_sweep, sweep_chunk
 from linkax.xla.waiting import Progress
 
 MOST_TASKS = 4096  # that an engine holds at once: enough for workers that join

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from linkax.studies.uncertainty import NO_INFLUENCE
+from linkax.studies.parameters.uncertainty import NO_INFLUENCE
 
 FIRST_DAMPING = 1e-2
 LEAST_DAMPING = 1e-12

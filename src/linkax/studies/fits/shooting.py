@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.numbers import is_finite, namespace, real, require, require_type
-from linkax.studies.parameters import as_arrays
+from linkax.studies.parameters.parameters import as_arrays
 from linkax.xla.arrays import Array
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from linkax.model.numbers import namespace, real, require
-from linkax.studies.deviations import matched
-from linkax.studies.sweep_result import Sweep
+from linkax.studies.sweeps.sweep_result import Sweep
+from linkax.studies.tolerances.deviations import matched
 from linkax.tables import Rows, Table, count, numbers, printed_as
 from linkax.xla.arrays import Array
 

@@ -10,8 +10,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 
 from linkax.model.numbers import is_finite, real, require
-from linkax.studies.parameters import AbstractParameter
-from linkax.studies.paths import path_parts
+from linkax.studies.parameters.parameters import AbstractParameter
+from linkax.studies.parameters.paths import path_parts
 from linkax.xla.arrays import Array
 
 

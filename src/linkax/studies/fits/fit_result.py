@@ -11,9 +11,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from linkax.model.numbers import require_type, whole_number
-from linkax.studies.experiments import Experiment
-from linkax.studies.laboratory import FITTED, Laboratory
-from linkax.studies.uncertainty import Spread
+from linkax.studies.laboratory.experiments import Experiment
+from linkax.studies.laboratory.laboratory import FITTED, Laboratory
+from linkax.studies.parameters.uncertainty import Spread
 from linkax.tables import Rows, Table, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
 

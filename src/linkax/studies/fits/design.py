@@ -11,12 +11,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from linkax.model.numbers import number, one_of, require, require_type, whole_number
-from linkax.studies.design_result import Design
-from linkax.studies.experiments import Experiment, Experiments, checked_experiments
-from linkax.studies.fit import check_output
-from linkax.studies.free_parameters import FreeParameters, has_prior
-from linkax.studies.parameters import AbstractParameter, Bounded, Positive
-from linkax.studies.uncertainty import Scatter, uncertainty
+from linkax.studies.fits.design_result import Design
+from linkax.studies.fits.fit import check_output
+from linkax.studies.laboratory.experiments import Experiment, Experiments, checked_experiments
+from linkax.studies.parameters.free_parameters import FreeParameters, has_prior
+from linkax.studies.parameters.parameters import AbstractParameter, Bounded, Positive
+from linkax.studies.parameters.uncertainty import Scatter, uncertainty
 from linkax.xla.arrays import Array
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import Progress, compiling

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from linkax.linalg.pivoted_qr import pivoted_qr
-from linkax.studies.free_parameters import FreeParameters
+from linkax.studies.parameters.free_parameters import FreeParameters
 from linkax.xla.arrays import Array
 
 NO_INFLUENCE = 1e-10  # sensitivity of a parameter, relative to the largest, up to which it has no influence

@@ -11,9 +11,8 @@ import numpy as np
 import optimistix as optx
 
 from linkax.model.numbers import number, require, require_type, whole_number
-from linkax.studies.experiments import Experiment
-from linkax.studies.fit_result import Fit, Starts
-from linkax.studies.fit_search import (
+from linkax.studies.fits.fit_result import Fit, Starts
+from linkax.studies.fits.fit_search import (
     AbstractSearch,
     Descent,
     Mode,
@@ -23,11 +22,12 @@ from linkax.studies.fit_search import (
     search_from_each,
     sensitivity,
 )
-from linkax.studies.free_parameters import FreeParameters
-from linkax.studies.laboratory import FITTED, Laboratory
-from linkax.studies.levenberg_marquardt import LevenbergMarquardt
-from linkax.studies.parameters import as_arrays
-from linkax.studies.uncertainty import DEPENDENT, uncertainty
+from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt
+from linkax.studies.laboratory.experiments import Experiment
+from linkax.studies.laboratory.laboratory import FITTED, Laboratory
+from linkax.studies.parameters.free_parameters import FreeParameters
+from linkax.studies.parameters.parameters import as_arrays
+from linkax.studies.parameters.uncertainty import DEPENDENT, uncertainty
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import compiling
 

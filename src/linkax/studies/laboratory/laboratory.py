@@ -9,10 +9,16 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, Int
 
-from linkax.studies.experiments import Experiment, Experiments, Noise, checked_experiments, predict
-from linkax.studies.losses import Loss, as_square, influence, spread
-from linkax.studies.sensors import AbstractSensor
-from linkax.studies.uncertainty import Scatter, leverages
+from linkax.studies.laboratory.experiments import (
+    Experiment,
+    Experiments,
+    Noise,
+    checked_experiments,
+    predict,
+)
+from linkax.studies.laboratory.losses import Loss, as_square, influence, spread
+from linkax.studies.laboratory.sensors import AbstractSensor
+from linkax.studies.parameters.uncertainty import Scatter, leverages
 from linkax.xla.users_line import warn
 
 TELLING = 0.05  # mean curvature of a robust loss, above which it tells how sure a fit is

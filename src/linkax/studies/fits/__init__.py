@@ -1,0 +1,1 @@
+"""Fits to measurements, profiles of their likelihood, and the design of experiments."""

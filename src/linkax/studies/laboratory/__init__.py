@@ -1,0 +1,1 @@
+"""What a laboratory has: records, sensors, experiments, and their noise."""

@@ -1,0 +1,1 @@
+"""One function for many parameters, here and on a cluster; formulations compared."""

@@ -1,0 +1,1 @@
+"""Dimensions of linkages for what they are to do."""

@@ -1,0 +1,1 @@
+"""Outputs that deviate where parameters do."""
