@@ -44,8 +44,8 @@ def by_linkax() -> Iterator[dict]:
 
     angle, mass = _angle(state), jnp.array(MASS)
     _, alone, _ = _timed(angle, mass)
-    for mode, transformed in (("backwards", jax.value_and_grad(angle)), ("forwards", _forwards(angle))):
-        (_, slope), seconds, compiling = _timed(transformed, mass)
+    for mode, derivative in MODES.items():
+        (_, slope), seconds, compiling = _timed(derivative(angle), mass)
         told = {"by": "linkax", "mode": mode, "derivative": float(slope), "ms": 1e3 * seconds}
         yield {**told, "run_ms": 1e3 * alone, "compile_s": compiling}
 
@@ -57,8 +57,8 @@ def of_a_batch() -> Iterator[dict]:
     for options in ({}, {"max_steps": 1000}):
         angle = _angle(state, **options)
         _, alone, _ = _timed(jax.vmap(angle), masses)
-        for mode, transformed in (("backwards", jax.value_and_grad(angle)), ("forwards", _forwards(angle))):
-            _, seconds, compiling = _timed(jax.vmap(transformed), masses)
+        for mode, derivative in MODES.items():
+            _, seconds, compiling = _timed(jax.vmap(derivative(angle)), masses)
             told = {"by": f"linkax, {MEMBERS} members", "mode": mode, **options, "ms": 1e3 * seconds}
             yield {**told, "run_ms": 1e3 * alone, "compile_s": compiling}
 
@@ -85,6 +85,10 @@ def _timed(function, mass):
 
 def _forwards(function):
     return lambda mass: jax.jvp(function, (mass,), (jnp.ones_like(mass),))
+
+
+# Function -> its value and derivative.
+MODES = {"backwards": jax.value_and_grad, "forwards": _forwards}
 
 
 def by_mujoco() -> Iterator[dict]:
