@@ -31,10 +31,22 @@ autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 
 # What linkax makes and its users read, without signature; named tuples are such too, but for those that users make.
-READ = {"Frame", "Load", "Mobility", "Motion", "Solution", "View"}
+READ = {"Attached", "Frame", "Load", "Mobility", "Motion", "Solution", "View"}
 WRITTEN = {"Inertia", "Pose", "Stepping", "Velocity"}
 # Classes whose methods users call; those of others are for linkax, as it moves joints and adds up forces.
-CALLED = {"AbstractForce", "Beam", "Fit", "Linearisation", "Mechanism", "Mobility", "Motion", "RigidBody", "Solution"}
+CALLED = {
+    "AbstractConstraint",
+    "AbstractForce",
+    "Attached",
+    "Beam",
+    "Fit",
+    "Linearisation",
+    "Mechanism",
+    "Mobility",
+    "Motion",
+    "RigidBody",
+    "Solution",
+}
 CALLED |= {"Sweep", "Trace", "View", "Workspace"}
 # What linkax itself calls of them.
 INTERNAL = {
@@ -44,12 +56,12 @@ INTERNAL = {
     "joint_speeds",
     "cut_speeds",
     "joint_rate",
-    "point_bias",
     "within",
     "element_length",
 }
 INTERNAL |= {"fastest_frequency", "nodes", "sections", "section_name", "needs_coordinate", "display_name"}
-INTERNAL |= {"conserves_energy", "switched", "side", "applied"}
+INTERNAL |= {"conserves_energy", "switched", "side", "applied", "held"}
+INTERNAL |= {"checked_residual", "check_residual", "row_scales", "pose", "coordinate"}
 
 
 def described(name):

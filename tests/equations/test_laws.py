@@ -18,6 +18,7 @@ from mechanisms import POOL, crank_slider, with_cut
 import linkax as lx
 from linkax.equations import dynamics, loops
 from linkax.equations.configuration import bodies_of_cuts, configure
+from linkax.equations.constraint_rows import constraint_load
 from linkax.equations.coordinates import neutral, on_manifold, rates, retract
 from linkax.equations.motion import move
 from linkax.equations.reactions import cut_reactions, reactions, seen_from
@@ -103,12 +104,13 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     on_parent = velocity(parent, configuration.parent_arm[joints] + configuration.separation)
     power = jnp.sum(cut.force * (velocity(child, configuration.child_arm[joints]) - on_parent))
     power += jnp.sum(cut.moment * (motion.angular_velocity[child] - motion.angular_velocity[parent]))
-    of_coordinates = multipliers[topology.num_rows - len(system.constraints) :]
-    for row, rope in loops.ropes(system):
-        pull = rope.load(configuration, of_coordinates[row] / system.coupling_unit[row])
+    of_constraints = multipliers[topology.num_rows - topology.num_constraint_rows :] / system.constraint_scales
+    asked = jnp.zeros_like(v)
+    if system.constraints:
+        pull = constraint_load(configuration, of_constraints)
         at_mass = motion.velocity[:-1] + cross(motion.angular_velocity[:-1], configuration.center_of_mass())
         power += jnp.sum(pull.force * at_mass + pull.moment * motion.angular_velocity[:-1])
-    asked = (system.coupling / system.coupling_unit[:, None]).T @ of_coordinates
+        asked = pull.joint_force
     body = topology.moved_body
     sign = jnp.where(topology.reversed[body], -1.0, 1.0)[:, None]
     left = jnp.sum(sign * (every.force[body] * configuration.sliding + every.moment[body] * configuration.angular), -1)
@@ -119,7 +121,9 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     left = left - jnp.where(own, load.joint_force + asked, 0.0)
     # On the parent, at its own frame: both sides of a joint balance about the world's origin.
     on_parents = seen_from(configuration, every, "parent", "ground")
-    places = [jnp.stack([configuration.point(getattr(joint, side)) for joint in mechanism.joints]) for side in SIDES]
+    places = [
+        jnp.stack([configuration.point_position(getattr(joint, side)) for joint in mechanism.joints]) for side in SIDES
+    ]
     about_origin = [r.moment + cross(place, r.force) for r, place in zip((every, on_parents), places, strict=True)]
     along_axes = seen_from(configuration, every, "child", "joint")
     axes = [
@@ -142,7 +146,7 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
         "symmetry": (mass, mass.T),
         "force": (force, applied - needed),
         "kinetic energy": (dynamics.kinetic_energy(motion), kinetic_energy(system, t, q, v)),
-        "loop rates": (jacobian @ v - loops.rate(system, t), rate(t, q, v)),
+        "loop rates": (jacobian @ v - loops.rate(configuration), rate(t, q, v)),
         "loop Jacobian": (jacobian, jax.jacfwd(lambda v: rate(t, q, v))(v)),
         "loop bias": (-loops.gamma(motion), along(rate, jnp.zeros_like(v))),
         "residual": (residual, rows(t, q, v)),

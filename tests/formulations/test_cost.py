@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import linkax as lx
-from linkax.equations import coordinates, joint_motions, loops
+from linkax.equations import constraint_rows, coordinates, joint_motions, loops
 from linkax.equations.coordinates import neutral
 from linkax.equations.structure import structure_of
 from linkax.equations.system import system_of
@@ -73,7 +73,7 @@ def test_special_elements_are_traced_where_they_are(monkeypatch):
     def refuse(*arguments):
         raise NotHereError
 
-    special = (coordinates, "multiply"), (loops, "_right_sides"), (loops, "combine")
+    special = (coordinates, "multiply"), (constraint_rows, "_load"), (loops, "combine")
     for module, name in (*special, (joint_motions, "_bent"), (ropes, "_spans")):
         monkeypatch.setattr(module, name, refuse)
     bar, hinge = lx.rod("bar", 1.0, 1.0), lx.Revolute("hinge", lx.GROUND, lx.rod("bar", 1.0, 1.0), "z")

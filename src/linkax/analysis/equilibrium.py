@@ -146,11 +146,12 @@ def _equilibrium(mechanism, state, t, moves):
     system = system_in(mechanism, state, t, moves)
     q, search = search_downhill(system, t, lax.stop_gradient(state.q))
     v, method = jnp.zeros(system.topology.num_speeds, system.dtype), STATICS.prepared(system.dtype)
-    missed, changes = jnp.zeros(len(system.constraints), system.dtype), jnp.zeros((), system.dtype)
+    topology = system.topology
+    missed, changes = jnp.zeros(topology.num_constraint_rows, system.dtype), jnp.zeros((), system.dtype)
     gap = jnp.where(jnp.all(jnp.isfinite(state.v)), widest_gap(system, t, q), jnp.inf)
     if moves:
         v = method.correct(system, t, q, v)[1]
-        driven = np.array([constraint.is_driven for constraint in system.constraints])
+        driven = np.array([constraint.is_driven for constraint in system.constraints])[topology.constraint_of_row]
         rates = missed_rates(system, t, state.q, state.v)[-len(driven) :]
         missed = jnp.where(driven, rates, 0.0)
         changes = _changes(system, method, t, q, v)

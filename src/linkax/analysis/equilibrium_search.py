@@ -10,9 +10,9 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from linkax.analysis.steady import Nearby, eigh
+from linkax.equations.constraint_rows import is_driven
 from linkax.equations.coordinates import retract
 from linkax.equations.dynamics import generalised_force
-from linkax.equations.loops import is_driven
 from linkax.equations.motion import Motion, move
 from linkax.equations.system import System
 from linkax.formulations.constraint_split import ConstraintSplit

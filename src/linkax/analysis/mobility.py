@@ -123,7 +123,7 @@ def joint_equations(topology: Topology) -> dict[str, int]:
         if isinstance(kind, type):
             plain = len(kind.locked_rotations) + len(kind.locked_translations)
             found[name] = plain + bool(kind.combined_rotations or kind.combined_translations)
-    return ByName(found | dict.fromkeys(topology.constraints, 1), "joint or constraint")
+    return ByName(found | dict(zip(topology.constraints, topology.constraint_rows, strict=True)), "joint or constraint")
 
 
 def _locking(topology: Topology) -> list[str]:
@@ -141,7 +141,7 @@ def row_names(topology: Topology) -> tuple[tuple[str, str], ...]:
         *rotation(topology.rotation_rows),
         *translation(topology.translation_rows),
         *((cuts[cut], "combined") for cut in topology.combining),
-        *((name, "coordinates") for name in topology.constraints),
+        *((topology.constraints[constraint], "coordinates") for constraint in topology.constraint_of_row),
         *rotation(topology.immobile_rotation_rows),
         *translation(topology.immobile_translation_rows),
     )

@@ -99,15 +99,17 @@ def missed_rates(
     system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
 ) -> Float[Array, " m"]:
     """|J v − b| of each loop row and constraint, relative to the largest speed and the largest rate b asked for."""
-    asked = rate(system, t)
+    configuration = configure(system, t, q)
+    asked = rate(configuration)
     size = jnp.maximum(system.fastest(v), largest(asked))
-    return ratio(jnp.abs(jacobian(configure(system, t, q)) @ v - asked), size)
+    return ratio(jnp.abs(jacobian(configuration) @ v - asked), size)
 
 
 def of_missed_rate(mechanism: Mechanism, missed: np.ndarray, row: int, t: Float[Array, ""]) -> str:
     """Name what asks for the rate of a row of `missed`, in which constraints come last, and the remedy."""
-    constraint = row - len(missed) + len(mechanism.constraints)
-    what = mechanism.constraints[constraint].display_name if constraint >= 0 else "a loop"
+    topology = mechanism.topology
+    last = row - len(missed) + topology.num_constraint_rows
+    what = mechanism.constraints[topology.constraint_of_row[last]].display_name if last >= 0 else "a loop"
     return (
         f"{what} asks for a rate that the state's speeds miss by {missed[row]:.3g} of the largest "
         f"at t = {float(t):.6g} s; make the state with linkax.assemble at that time"

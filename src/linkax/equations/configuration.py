@@ -6,7 +6,6 @@ need products along the way. Featherstone, Rigid Body Dynamics Algorithms (2008)
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,11 +16,12 @@ from linkax.equations.joint_motions import joint_motions
 from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, over_subtree, product_along_path, sum_by_speed
 from linkax.linalg.static_sparse import constant_product
+from linkax.model.attached import AbstractPoses, BodyPose
 from linkax.model.beams import Beam
 from linkax.model.bodies import Frame
 from linkax.model.forces import Load
 from linkax.model.joints.bending import section_at
-from linkax.model.numbers import Number, value
+from linkax.model.numbers import Number
 from linkax.model.terms import Term
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.rotations import compose, rotate, transpose
@@ -30,7 +30,7 @@ from linkax.xla.arrays import Array, Scalar, ScalarLike
 from linkax.xla.tracing import jit_inline
 
 
-class Configuration(eqx.Module):
+class Configuration(AbstractPoses):
     """Poses of all bodies at time t and coordinates q. Last row of body arrays with n_b + 1 rows: ground.
 
     - `rotation`: orientation of each body, axes as columns, (n_b + 1, 3, 3).
@@ -89,26 +89,13 @@ class Configuration(eqx.Module):
         """Vector from the reference point of a frame's body to the frame's origin, in ground axes [m]."""
         return self.rotation[self.body(frame.body)] @ jnp.asarray(frame.offset, self.system.dtype)
 
-    def axes(self, frame: Frame) -> Float[Array, "3 3"]:
-        """Axes of a frame in ground axes, as columns."""
-        return self.rotation[self.body(frame.body)] @ jnp.asarray(value(frame.rotation), self.system.dtype)
-
-    def _place(self, frame):
-        """Origin of a frame from the anchor of its tree, and that anchor."""
-        body = self.body(frame.body)
-        if body == GROUND_INDEX:
-            return jnp.zeros(3, self.system.dtype), jnp.asarray(frame.offset, self.system.dtype)
-        return self.position[body] + self.arm(frame), self.system.anchor[self.system.topology.root[body]]
-
-    def point(self, frame: Frame) -> Float[Array, "3"]:
-        """Origin of a frame in the world [m]."""
-        place, anchor = self._place(frame)
-        return place + anchor
-
-    def between(self, first: Frame, second: Frame) -> Float[Array, "3"]:
-        """Vector from the origin of one frame to that of another [m]."""
-        (near, near_anchor), (far, far_anchor) = self._place(first), self._place(second)
-        return (far - near) + (far_anchor - near_anchor)
+    def pose(self, body: str) -> BodyPose:
+        index, nothing = self.body(body), jnp.zeros(3, self.system.dtype)
+        if index == GROUND_INDEX:
+            return BodyPose(self.rotation[index], nothing, nothing)
+        return BodyPose(
+            self.rotation[index], self.position[index], self.system.anchor[self.system.topology.root[index]]
+        )
 
     def point_load(self, frame: Frame, force: Real[Array, "3"], moment: Real[Array, "3"] | float = 0.0) -> Load:
         """Make the load of a force at a frame's origin, and a moment, in ground axes [N, N m]; none on the ground."""

@@ -63,7 +63,7 @@ class Gap(NamedTuple):
 
     def in_scales(self, system: System) -> "Gap":
         """The same in radians and lengths of the mechanism."""
-        return Gap(self.distance / system.length, self.angle, self.constraints / system.coupling_unit)
+        return Gap(self.distance / system.length, self.angle, self.constraints / system.constraint_scales)
 
     def widest(self) -> Float[Array, ""]:
         """The largest of all; not a number where one is none."""
@@ -79,7 +79,8 @@ def gaps(configuration: Configuration) -> Gap:
     across = jnp.linalg.norm(cross(transpose(parent_axes), transpose(child_axes)), axis=-1)
     angle = jnp.arctan2(across, jnp.sum(parent_axes * child_axes, axis=-2))
     rows = residual(configuration)
-    first, last = topology.num_rows - len(topology.combining) - len(system.constraints), len(system.constraints)
+    last = topology.num_constraint_rows
+    first = topology.num_rows - len(topology.combining) - last
     combined = jnp.zeros(topology.num_cuts, system.dtype)
     if topology.combining:
         cuts = np.array(topology.combining)
@@ -88,5 +89,5 @@ def gaps(configuration: Configuration) -> Gap:
     return Gap(
         distance=jnp.linalg.norm(distance, axis=-1),
         angle=jnp.max(jnp.where(held, angle, 0.0), axis=-1, initial=0.0),
-        constraints=jnp.abs(rows[topology.num_rows - last :] * system.coupling_unit),
+        constraints=jnp.abs(rows[topology.num_rows - last :] * system.constraint_scales),
     )

@@ -13,7 +13,8 @@ from linkax.equations.configuration import Configuration
 from linkax.equations.joint_motions import over_bending
 from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, expand_to_motions, sum_by_body
-from linkax.model.bodies import BodyOrFrame, Frame, frame_of
+from linkax.model.attached import alone
+from linkax.model.bodies import BodyOrFrame, frame_of
 from linkax.model.forces import Load
 from linkax.model.numbers import Number
 from linkax.model.terms import Term
@@ -56,11 +57,11 @@ class Motion(eqx.Module):
 
     def joint(self, name: str) -> Float[Array, ""] | Float[Array, " n"]:
         """Coordinate of a joint, in the tree or cut [rad or m]; (n,) where it has several."""
-        return _alone(self.configuration.joint_coordinates(name))
+        return self.configuration.joint(name)
 
     def joint_speed(self, name: str) -> Float[Array, ""] | Float[Array, " n"]:
         """Speed of a joint, in the tree or cut [rad/s or m/s]; (n,) where it has several."""
-        return _alone(self.joint_speeds(name))
+        return alone(self.joint_speeds(name))
 
     def joint_speeds(self, name: str) -> Float[Array, " n"]:
         """Speeds of a joint, in the tree or cut [rad/s or m/s]."""
@@ -96,16 +97,14 @@ class Motion(eqx.Module):
 
     def point_position(self, point: BodyOrFrame) -> Float[Array, "3"]:
         """Position of a point in ground axes [m]: the origin of `body.at(...)`, or of a body's reference frame."""
-        return self.configuration.point(frame_of(point, "point"))
+        return self.configuration.point_position(point)
 
     def orientation(self, body: BodyOrFrame | str) -> Float[Array, "3 3"]:
         """Axes of a body's reference frame, or of a frame `body.at(...)`, as columns in ground axes.
 
         `body`: also the name of one. R = orientation takes a vector from the body's axes to ground axes by R @ vector.
         """
-        if isinstance(body, str):
-            return self.configuration.rotation[self.configuration.body(body)]
-        return self.configuration.axes(frame_of(body, "body"))
+        return self.configuration.orientation(body)
 
     def point_velocity(self, point: BodyOrFrame) -> Float[Array, "3"]:
         """Velocity of a point in ground axes [m/s]; see `point_position`."""
@@ -113,19 +112,9 @@ class Motion(eqx.Module):
         body = self.configuration.body(frame.body)
         return self.velocity[body] + cross(self.angular_velocity[body], self.configuration.arm(frame))
 
-    def point_bias(self, frame: Frame) -> Float[Array, "3"]:
-        """Velocity-product acceleration of the origin of a frame [m/s²]."""
-        body, arm = self.configuration.body(frame.body), self.configuration.arm(frame)
-        omega = self.angular_velocity[body]
-        return self.bias[body] + cross(self.angular_bias[body], arm) + cross(omega, cross(omega, arm))
-
     def point_load(self, point: BodyOrFrame, force: Real[Array, "3"], moment: Real[Array, "3"] | float = 0.0) -> Load:
         """Make the load of a force at a point, and a moment, in ground axes [N, N m]; none on the ground."""
         return self.configuration.point_load(frame_of(point, "point"), force, moment)
-
-
-def _alone(values):
-    return values[0] if len(values) == 1 else values
 
 
 @jit_inline

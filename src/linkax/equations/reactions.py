@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, bodies_of_cuts
+from linkax.equations.constraint_rows import constraint_load
 from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
 from linkax.equations.loop_rows import RowVectors, combined_rows, immobile_rows, plain_rows
-from linkax.equations.loops import ropes, sorted_multipliers
+from linkax.equations.loops import sorted_multipliers
 from linkax.equations.motion import Motion
 from linkax.equations.tree_sums import expand_to_motions, over_subtree, sum_by_body
 from linkax.model.forces import Load
@@ -115,11 +116,8 @@ def _carried(configuration: Configuration, needed: Load, cut: Reaction, multipli
     system, topology = configuration.system, configuration.system.topology
     count = topology.num_bodies
     force, moment, joint_force = needed
-    asked = sorted_multipliers(configuration, multipliers).constraints
-    joint_force = joint_force + asked @ system.coupling
-    for row, rope in ropes(system):
-        of_rope = rope.load(configuration, asked[row])
-        force, moment = force - of_rope.force, moment - of_rope.moment
+    held = constraint_load(configuration, sorted_multipliers(configuration, multipliers).constraints)
+    force, moment, joint_force = force - held.force, moment - held.moment, joint_force + held.joint_force
     moment = moment + cross(configuration.position[:-1] + configuration.center_of_mass(), force)
 
     # All moments about the anchor of each body's tree from here on.

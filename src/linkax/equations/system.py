@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from linkax.equations.structure import Structure, structure_of
-from linkax.model.constraints import AbstractConstraint, LinearConstraint
+from linkax.model.constraints import AbstractConstraint
 from linkax.model.joints.joint import RelativeMotion
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
@@ -38,8 +38,7 @@ class System(KnowsEntries):
     - `loop_length` [m] (n_cut,): half the way around each loop, the unit of its translation rows.
     - `length` [m]: the mechanism's length, the unit of sliding coordinates.
     - `forces`: force elements, or such held on one side of their switch.
-    - `coupling` (k, n_v): coefficients of the constraints on coordinates of the tree, and
-      `coupling_unit` (k,): the largest of each, in radians and lengths of the mechanism; `length` for ropes.
+    - `constraint_scales` (k,): one unit of each row of the constraints, in radians and lengths of the mechanism.
     """
 
     topology: Topology = eqx.field(static=True)
@@ -55,8 +54,7 @@ class System(KnowsEntries):
     group_parameters: tuple[Float[Array, "_ _"] | None, ...]
     loop_length: Float[Array, " n_cut"]
     length: Float[Array, ""]
-    coupling: Float[Array, "k n_v"]
-    coupling_unit: Float[Array, " k"]
+    constraint_scales: Float[Array, " k"]
     constraints: tuple[AbstractConstraint, ...]
     forces: tuple[Any, ...]
 
@@ -111,8 +109,8 @@ def _stacked(mechanism, dtype, fixed_scales) -> System:
     bent = stack([joint.length_estimate for joint in joints], ()) if np.any(bends) else None
     ends = fixed(parent_offset), fixed(child_offset)
     loop_length, length = _lengths(topology, *ends, fixed(center_of_mass), bent)
-    coupling = _coupling(mechanism, dtype)
-    slides = jnp.where(topology.slides, length, jnp.ones((), dtype))
+    slides = lambda along: bool(topology.slides[topology.column(along)])
+    constraint_scales = [unit for each in mechanism.constraints for unit in each.row_scales(length, slides)]
     return System(
         known=None,
         topology=topology,
@@ -133,28 +131,10 @@ def _stacked(mechanism, dtype, fixed_scales) -> System:
         joint_parameter=stack([0.0 if joint.parameter is None else joint.parameter for joint in joints], ()),
         loop_length=loop_length,
         length=length,
-        coupling=coupling,
-        coupling_unit=_coupling_unit(mechanism, fixed(coupling) * slides, length),
+        constraint_scales=fixed(stack(constraint_scales, ())),
         constraints=mechanism.constraints,
         forces=mechanism.forces,
     )
-
-
-def _coupling(mechanism, dtype):
-    """Coefficients of the constraints on coordinates of the tree, (k, n_v)."""
-    topology, constraints = mechanism.topology, mechanism.constraints
-    coupling = jnp.zeros((len(constraints), topology.num_speeds), dtype)
-    for row, constraint in enumerate(constraints):
-        if isinstance(constraint, LinearConstraint):
-            columns = np.array([topology.column(term) for term in constraint.terms])
-            coupling = coupling.at[row, columns].set(jnp.asarray(constraint.coefficients, dtype))
-    return coupling
-
-
-def _coupling_unit(mechanism, coefficients, length):
-    largest = jnp.max(jnp.abs(coefficients), axis=1)
-    linear = np.array([isinstance(constraint, LinearConstraint) for constraint in mechanism.constraints], dtype=bool)
-    return largest if np.all(linear) else jnp.where(linear, largest, length)
 
 
 def _lengths(topology, parent_offset, child_offset, center_of_mass, bent):

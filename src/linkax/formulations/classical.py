@@ -119,7 +119,7 @@ class ClassicalFormulation(AbstractFormulation):
         mass, rows = _in_scales(at)
         if system.topology.num_rows == 0:
             return Dynamics(scales * _solve(mass, scales * force), right, right)
-        open_, rate_open = residual(at.configuration), at.jacobian @ v - rate(system, at.configuration.t)
+        open_, rate_open = residual(at.configuration), at.jacobian @ v - rate(at.configuration)
         alpha, beta = self.stabilisation.alpha, self.stabilisation.beta
         stabilised = right - 2.0 * alpha * rate_open - beta**2 * open_
         acceleration, multipliers = _accelerate(self.acceleration, mass, rows, scales * force, stabilised)
@@ -163,7 +163,7 @@ class ClassicalFormulation(AbstractFormulation):
         q = lax.fori_loop(0, self.sweeps, closer, q)
         at, back = inverse(q)
         remaining = tuple(error - back @ (at.jacobian @ error) for error in errors)
-        return q, v - back @ (at.jacobian @ v - rate(system, t)), remaining, one
+        return q, v - back @ (at.jacobian @ v - rate(at.configuration)), remaining, one
 
     def close(
         self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]

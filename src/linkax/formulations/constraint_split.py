@@ -66,7 +66,7 @@ class ConstraintSplit(eqx.Module):
 
         **Arguments:** `scale`: a factor of the speeds v, whose square is one of γ.
         """
-        gamma, scales = self._bias(v) + self._driven(scale), self.configuration.system.scales
+        gamma, scales = self._bias(v) + self._driven(v, scale), self.configuration.system.scales
         # With derivatives, which the split has none of; J a is the same in any metric.
         metric, still = jnp.diag(scales**-2), jnp.zeros_like(v)
         return (
@@ -74,8 +74,8 @@ class ConstraintSplit(eqx.Module):
             - self.jacobian @ constrained_solve(self.inverse, metric, self.jacobian, still, gamma, refinements=0)[0]
         )
 
-    def _driven(self, scale):
-        return drive_acceleration(self.configuration.system, self.configuration.t) / scale**2
+    def _driven(self, v, scale):
+        return drive_acceleration(move(self.configuration, v), 1.0 / scale)
 
     def along(
         self, v: Float[Array, " n_v"], from_rest: bool | Bool[Array, ""]
@@ -104,7 +104,7 @@ class ConstraintSplit(eqx.Module):
             return jnp.sum(jnp.abs(jnp.diagonal(pivoted_qr(block).r)) > OPENING)
 
         opened = jnp.stack([opening(*island) for island in self.configuration.system.structure.islands])
-        driven = self._driven(jnp.where(from_rest, jnp.sqrt(scale), scale))
+        driven = self._driven(jnp.where(from_rest, 0.0, direction), jnp.where(from_rest, jnp.sqrt(scale), scale))
         return outside[:, 0] + self._outside(driven), self.inverse.rank + opened
 
 

@@ -14,9 +14,10 @@ from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import configure
+from linkax.equations.constraint_rows import is_driven
 from linkax.equations.coordinates import on_manifold, retract
 from linkax.equations.dynamics import generalised_force
-from linkax.equations.loops import gamma, is_driven, residual
+from linkax.equations.loops import gamma, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import linear_system

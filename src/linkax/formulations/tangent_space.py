@@ -136,7 +136,7 @@ class TangentSpace(AbstractFormulation):
         `refinements`: steps of iterative refinement, for factors of a configuration close by.
         """
         weight, configuration = self._weight(linear), linear.configuration
-        b = rate(configuration.system, configuration.t)
+        b = rate(configuration)
         product = self._saddle_point(linear, weight, self._weight_blocks(linear))
         momentum = product(jnp.concatenate([v, jnp.zeros_like(b)]))[: len(v)]
         return constrained_solve(split, weight, linear.jacobian, momentum, b, refinements, product)[0]

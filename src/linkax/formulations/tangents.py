@@ -70,7 +70,7 @@ def state_tangent(
     configuration, to_configuration = eqx.filter_jvp(configure, (system, t, q), (tangents.system, tangents.t, to_q))
     rows, to_rows = eqx.filter_jvp(jacobian, (configuration,), (to_configuration,))
     if onto is not None:
-        asked = lambda configuration, rows, v: rows @ v - rate(configuration.system, configuration.t)
+        asked = lambda configuration, rows, v: rows @ v - rate(configuration)
         _, missed = pushforward(asked, (configuration, rows, v), (to_configuration, to_rows, to_v))
         to_v = to_v - onto(missed)
     return StateTangent(configuration, rows, v, to_configuration, to_rows, to_q, to_v)

@@ -1,8 +1,9 @@
-"""Constraints besides those of cut joints: gears, ropes over sheaves, drives."""
+"""Constraints besides those of cut joints: any of one's own, couplings of joints, drives."""
 
 import abc
+import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,34 +11,145 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from linkax.model.elements import AbstractElement
-from linkax.model.functions import Law, held_unless
+from linkax.model.attached import Attached, BodyPose
+from linkax.model.bodies import Frame
+from linkax.model.elements import ENDED, AbstractElement, Time
+from linkax.model.functions import Law, raised
+from linkax.model.names import ByName
 from linkax.model.numbers import Number, number, require
 from linkax.model.terms import Term, TermLike, term
 from linkax.xla.arrays import Array, Scalar
 
+# What a row of each unit is one of: 1, or a power of the mechanism's length.
+POWERS_OF_LENGTH = {"": 0, "rad": 0, "m": 1, "m²": 2}
+
 
 class AbstractConstraint(AbstractElement):
-    """One equation, value = right side. `Solution.reaction` of its name is its multiplier."""
+    """Equations g(t, q) = 0 between bodies and joints. To make your own, subclass it and define `residual`.
+
+    JAX derives all else: the rows J = ∂g/∂q, the term γ of accelerations, and the forces of the multipliers. What
+    it attaches to are the frames among its fields, and the joints that `joints` names, which go into the spanning tree.
+    Its other fields that hold numbers are traced.
+
+    `Solution.reaction` of its name is its multiplier μ, or an array of them, (n_t, k): a force [N] for a row in metres,
+    a moment [N m] for one in radians. They act as the generalised force Jᵀμ, along growing g.
+
+    - `units`: of the rows, one for each number of the residual: "m", "rad", "m²", or "" for a plain number.
+    - `is_driven`: whether the residual depends on time.
+    """
+
+    units: ClassVar[tuple[str, ...]] = ("m",)
+    is_driven: ClassVar[bool] = False
 
     name: str = eqx.field(static=True)
+
+    @abc.abstractmethod
+    def residual(self, t: Time, attached: Attached) -> Scalar | Float[Array, " k"]:
+        """Compute g at time t [s]: one number, or (k,), twice differentiable by JAX.
+
+        **Arguments:** `attached`: where its bodies and joints are; see `linkax.Attached`.
+        """
 
     @property
     def display_name(self) -> str:
         return f"{type(self).__name__.lower()} {self.name!r}"
 
     @property
-    def is_driven(self) -> bool:
-        """Whether the right side depends on time."""
-        return False
+    def frames(self) -> tuple[Frame, ...]:
+        fields = [getattr(self, field.name) for field in dataclasses.fields(self)]
+        leaves = jax.tree.leaves(fields, is_leaf=lambda leaf: isinstance(leaf, Frame))
+        return tuple(leaf for leaf in leaves if isinstance(leaf, Frame))
 
-    @abc.abstractmethod
-    def right_side(self, t: Number) -> Scalar:
-        """Compute the right side at time t [s]."""
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints whose coordinates it reads."""
+        return ()
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return tuple(Term(name, None) for name in self.joints)
+
+    def row_scales(self, length: Scalar, slides: Callable[[Term], bool]) -> list[Scalar]:
+        """Compute one unit of each row in radians and lengths of the mechanism.
+
+        **Arguments:** `length`: of the mechanism [m]; `slides`: whether the coordinate of a term is in metres.
+        """
+        return [length ** POWERS_OF_LENGTH[unit] for unit in self.units]
+
+    def checked_residual(self, t: Time, attached: Attached) -> Float[Array, " k"]:
+        """Compute the residual and check it.
+
+        **Raises:** `ValueError` for a residual that raises, or has another shape than `units`.
+        """
+        try:
+            found = jnp.asarray(self.residual(t, attached))
+        except ENDED as error:
+            if isinstance(error, ValueError) and str(error).startswith(self.display_name):
+                raise
+            told = raised(error, self.residual, (t, attached))
+            raise ValueError(f"{self.display_name}: its residual raises {told}") from error
+        count = len(self.units)
+        if found.shape not in ((count,), () if count == 1 else (count,)):
+            raise ValueError(
+                f"{self.display_name}: its residual has shape {found.shape}, and units {self.units} are {count}; give "
+                "one unit for each of its numbers"
+            )
+        return found.reshape(count)
+
+    def check_residual(self, coordinates: Mapping[str, int]) -> None:
+        """Evaluate the residual for its shape, and for whether it depends on time.
+
+        **Arguments:** `coordinates`: how many each of its joints has.
+
+        **Raises:** `ValueError` as `checked_residual` does, and for a residual that reads t without `is_driven`.
+        """
+        turned = BodyPose(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))
+        poses = ByName({frame.body: turned for frame in self.frames}, f"body of {self.display_name}")
+        joints = {name: jnp.zeros(coordinates[name]) for name in self.joints}
+        attached = Attached(poses, ByName(joints, f"joint of {self.display_name}"), ())
+        traced = jax.make_jaxpr(lambda t: self.checked_residual(t, attached))(0.0).jaxpr
+        (time,) = traced.invars
+        reads = any(time is variable for step in traced.eqns for variable in step.invars)
+        if reads and not self.is_driven:
+            raise ValueError(f"{self.display_name}: its residual reads t; say `is_driven = True` in its class")
 
     def held(self, t: Number, unless: Any = False) -> "AbstractConstraint":
-        """Keep the right side of time t at all times, except where `unless`, which may be traced."""
-        return self
+        """Keep the residual of time t at all times, except where `unless`, which may be traced."""
+        return HeldConstraint(self, t, unless) if self.is_driven else self
+
+
+class HeldConstraint(AbstractConstraint):
+    """A constraint at a time t at which it stays, except where `unless`."""
+
+    constraint: AbstractConstraint
+    t: Scalar
+    unless: Any
+
+    def __init__(self, constraint: AbstractConstraint, t: Number, unless: Any) -> None:
+        self.name, self.constraint, self.t, self.unless = constraint.name, constraint, jnp.asarray(t), unless
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return self.constraint.units
+
+    @property
+    def is_driven(self) -> bool:
+        return self.unless is not False
+
+    @property
+    def display_name(self) -> str:
+        return self.constraint.display_name
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        return self.constraint.frames
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return self.constraint.joints
+
+    def residual(self, t: Number, attached: Attached) -> Scalar | Float[Array, " k"]:
+        return self.constraint.residual(self.t + jnp.where(self.unless, t - self.t, 0.0), attached)
 
 
 class LinearConstraint(AbstractConstraint):
@@ -46,12 +158,32 @@ class LinearConstraint(AbstractConstraint):
     - `related`: the terms of these coordinates.
     """
 
+    units = ("",)
+
     related: tuple[Term, ...] = eqx.field(static=True)
     coefficients: Float[Array, " n"]
 
     @property
+    def joints(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(along.joint for along in self.related))
+
+    @property
     def terms(self) -> tuple[Term, ...]:
         return self.related
+
+    @abc.abstractmethod
+    def right_side(self, t: Number) -> Scalar:
+        """Compute the right side at time t [s]."""
+
+    def residual(self, t: Number, attached: Attached) -> Scalar:
+        found = -jnp.asarray(self.right_side(t))
+        for along, coefficient in zip(self.related, self.coefficients, strict=True):
+            found = found + coefficient * attached.coordinate(along)
+        return found
+
+    def row_scales(self, length: Scalar, slides: Callable[[Term], bool]) -> list[Scalar]:
+        units = [length if slides(along) else 1.0 for along in self.related]
+        return [jnp.max(jnp.abs(jnp.stack([c * unit for c, unit in zip(self.coefficients, units, strict=True)])))]
 
 
 class Coupling(LinearConstraint):
@@ -113,6 +245,8 @@ class Drive(LinearConstraint):
     nor `speed`, and for both.
     """
 
+    is_driven = True
+
     motion: Law | None
     speed: Scalar | None
     start: Scalar | None
@@ -145,21 +279,12 @@ class Drive(LinearConstraint):
         self.motion = Law(motion, (), what)
         jax.eval_shape(self.motion, jnp.zeros(()))
 
-    @property
-    def is_driven(self) -> bool:
-        return True
-
     def right_side(self, t: Number) -> Scalar:
         if self.motion is not None:
             return self.motion(t)
         assert self.speed is not None
         assert self.start is not None
         return self.start + self.speed * t
-
-    def held(self, t: Number, unless: Any = False) -> "Drive | Coupling":
-        if unless is not False:
-            return Drive(self.name, self.terms[0], held_unless(self.right_side, t, unless))
-        return Coupling(self.name, {self.terms[0]: 1.0}, self.right_side(t))
 
 
 def checked_name(name: Any, what: str) -> str:

@@ -15,6 +15,9 @@ Motion = Any
 Configuration = Any
 System = Any
 
+# What a mistake in a user's own element raises.
+ENDED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+
 
 class AbstractElement(eqx.Module):
     """A force element or a constraint."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import Frame
-from linkax.model.elements import AbstractElement, Configuration, Motion, System, Time
+from linkax.model.elements import ENDED, AbstractElement, Configuration, Motion, System, Time
 from linkax.model.functions import raised
 from linkax.model.numbers import Vector, number
 from linkax.xla.arrays import Array, Scalar
@@ -38,7 +38,6 @@ class Load(NamedTuple):
         return Load(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-ENDED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)  # what a user's mistake raises
 GIVE_LOAD = "give a linkax.Load, made by motion.point_load, motion.joint_load or Load.none(motion.system)"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.model.code import Code
-from linkax.model.numbers import Number, converted, number
+from linkax.model.numbers import converted, number
 from linkax.xla.arrays import Array
 
 # What JAX raises where a function asks a traced number for its value.
@@ -110,12 +110,3 @@ def number_or_law(entry: Any, shape: tuple[int, ...], what: str) -> Array | Law:
 def evaluated(entry: Numbers | Law, *arguments: Any) -> Numbers | jax.Array:
     """Return a number, or what a `Law` returns for these arguments."""
     return entry(*arguments) if isinstance(entry, Law) else entry
-
-
-def held_unless(law: Callable[[Any], Any], t: Number, moves: Any) -> Callable[..., Any]:
-    """Return a function of time that goes on where `moves`, and elsewhere keeps its value at time t."""
-    return jax.tree_util.Partial(_held_unless, law, t, moves)
-
-
-def _held_unless(law: Callable[[Any], Any], start: Number, moves: Any, t: Number) -> jax.Array:
-    return law(start) + jnp.where(moves, law(t) - law(start), 0.0)

@@ -9,7 +9,7 @@ import equinox as eqx
 
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
-from linkax.model.constraints import AbstractConstraint
+from linkax.model.constraints import AbstractConstraint, LinearConstraint
 from linkax.model.description import described
 from linkax.model.discretisation import Parts, discretise_beams, tree_joints_first
 from linkax.model.forces import AbstractForce, given_name
@@ -41,7 +41,7 @@ class Mechanism(eqx.Module):
     - `bodies`: `RigidBody` and `Beam`; names unique.
     - `joints`: `Revolute`, `Prismatic` and others; names unique among joints and constraints.
     - `forces`: `Gravity`, `Spring` and others.
-    - `constraints`: `Coupling`, `Drive`, `Rope` and `Distance`.
+    - `constraints`: `Coupling`, `Drive`, `Rope`, `Distance`, and your own, see `linkax.AbstractConstraint`.
     - `all_rows`: keep also loop rows that no motion changes, such as the out-of-plane rows of a planar loop. The
       motion is the same; Lagrange multipliers fail on such rows.
 
@@ -196,6 +196,7 @@ def _topology(tree: SpanningTree, constraints: list[AbstractConstraint], all_row
         driven_by=tuple(joint.driven_by for joint in joints),
         **split_rows(tree, all_rows),
         constraints=tuple(constraint.name for constraint in constraints),
+        constraint_rows=tuple(len(constraint.units) for constraint in constraints),
         constraint_terms=tuple(constraint.terms for constraint in constraints),
         constraint_bodies=tuple(tuple(index[f.body] for f in constraint.frames) for constraint in constraints),
     )
@@ -234,7 +235,10 @@ def _check_references(
         check_frames(constraint.display_name, constraint.frames)
         for name, index in constraint.terms:
             check_joint(constraint.display_name, name)
-            _check_index(constraint.display_name, joints[name], index, True)
+            if isinstance(constraint, LinearConstraint):
+                _check_index(constraint.display_name, joints[name], index, True)
+        if not type(constraint).__module__.startswith("linkax."):
+            constraint.check_residual({name: joints[name].num_coordinates for name in constraint.joints})
 
 
 def _check_index(what: str, joint: AbstractJoint, index: int | None, needs_coordinate: bool) -> None:

@@ -97,8 +97,10 @@ def _unchanging(entry: Any, dtype: np.dtype) -> np.ndarray:
 
 
 def read_only(tree: Tree) -> Tree:
-    """Replace NumPy arrays that can be written to by copies that cannot."""
-    return jax.tree.map(lambda leaf: _unchanging(leaf, leaf.dtype) if can_change(leaf) else leaf, tree)
+    """Replace NumPy arrays that can be written to by copies that cannot, and Python's real numbers by arrays."""
+    number = lambda leaf: np.asarray(leaf) if isinstance(leaf, float) else leaf
+    fixed = lambda leaf: _unchanging(leaf, leaf.dtype) if can_change(leaf) else leaf
+    return jax.tree.map(lambda leaf: fixed(number(leaf)), tree)
 
 
 def _known_parts(entry):

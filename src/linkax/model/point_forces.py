@@ -143,7 +143,7 @@ class _OnPoint(AbstractForce):
 
     def _in_ground_axes(self, entry: Array | Law, t: Number, motion: Motion) -> Float[Array, "3"]:
         vector = evaluated(entry, t, motion)
-        return motion.configuration.axes(self.point) @ vector if self.axes == "frame" else vector
+        return motion.orientation(self.point) @ vector if self.axes == "frame" else vector
 
 
 class PointForce(_OnPoint):

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from linkax.model.attached import Attached
 from linkax.model.bodies import AbstractBody, BodyOrFrame, Frame, frame_of
 from linkax.model.constraints import AbstractConstraint, checked_name
 from linkax.model.elements import Configuration, Motion
 from linkax.model.forces import AbstractForce, Load
-from linkax.model.functions import Law, evaluated, held_unless
+from linkax.model.functions import Law, evaluated
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, listed, positive, zero_or_more
 from linkax.spatial.vectors import dot, length
@@ -89,40 +90,15 @@ class Rope(AbstractConstraint):
             self.length = positive(length, f"rope {name!r}: length [m]")
 
     @property
-    def frames(self) -> tuple[Frame, ...]:
-        return self.points
-
-    @property
     def is_driven(self) -> bool:
         return isinstance(self.length, Law)
 
-    def right_side(self, t: Number) -> Scalar:
-        return -evaluated(self.length, t)
-
-    def held(self, t: Number, unless: Any = False) -> "Rope":
-        if not isinstance(self.length, Law):
-            return self
-        length = evaluated(self.length, t) if unless is False else held_unless(self.length, t, unless)
-        return Rope(self.name, self.points, length)
-
-    def value(self, configuration: Configuration) -> Scalar:
-        """Compute minus its length [m]; with this sign its multiplier is the tension."""
-        return -self.extent(configuration)
+    def residual(self, t: Number, attached: Attached) -> Scalar:
+        """Compute what it is too long; with this sign its multiplier is the tension."""
+        return evaluated(self.length, t) - self.extent(attached)
 
     def extent(self, configuration: Configuration) -> Scalar:
         return jnp.sum(length(_spans(configuration, self.points)))
-
-    def load(self, configuration: Configuration, tension: Number) -> Load:
-        """Compute its load on its points at a tension [N]."""
-        return _pull(configuration, self.points, tension)
-
-    def bias(self, motion: Motion) -> Scalar:
-        """Compute the part of its length's acceleration that velocities alone cause [m/s²]."""
-        spans, rate = _spans(motion.configuration, self.points), _rate(motion, self.points)
-        points = jnp.stack([motion.point_bias(point) for point in self.points])
-        along, size = _directions(spans), length(spans)
-        turning = dot(rate, rate) - dot(along, rate) ** 2
-        return jnp.sum(dot(along, points[1:] - points[:-1]) + ratio(turning, size))
 
 
 class ElasticRope(AbstractForce):

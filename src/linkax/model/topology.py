@@ -43,8 +43,8 @@ class Topology:
     - `rotation_rows`: (cut joint, i, j) of each loop row h₁ⁱ·h₂ʲ; cut joints and axes counted from 0.
     - `translation_rows`: (cut joint, i) of each loop row h₁ⁱ·s.
     - `immobile_rotation_rows`, `immobile_translation_rows`: rows that no motion changes, which are left out of these.
-    - `constraints`: names of the constraints on coordinates of the tree, one row each.
-    - `constraint_terms`: the terms that each constraint relates.
+    - `constraints`: names of the constraints besides cut joints, and `constraint_rows`, how many rows each has.
+    - `constraint_terms`: the terms that each constraint reads.
     - `constraint_bodies`: the bodies that each constraint attaches to.
 
     The loop constraints have rotation rows, translation rows, a combined row for each cut joint whose type has
@@ -63,6 +63,7 @@ class Topology:
     immobile_rotation_rows: tuple[tuple[int, int, int], ...]
     immobile_translation_rows: tuple[tuple[int, int], ...]
     constraints: tuple[str, ...] = ()
+    constraint_rows: tuple[int, ...] = ()
     constraint_terms: tuple[tuple[Term, ...], ...] = ()
     constraint_bodies: tuple[tuple[int, ...], ...] = ()
 
@@ -105,7 +106,17 @@ class Topology:
     def num_rows(self) -> int:
         """Number of rows of the loop constraints."""
         plain = len(self.rotation_rows) + len(self.translation_rows)
-        return plain + len(self.combining) + len(self.constraints)
+        return plain + len(self.combining) + self.num_constraint_rows
+
+    @property
+    def num_constraint_rows(self) -> int:
+        """Number of rows of `constraints`, which come last."""
+        return sum(self.constraint_rows)
+
+    @cached_property
+    def constraint_of_row(self) -> np.ndarray:
+        """The constraint that each of these rows belongs to, (k,)."""
+        return np.repeat(np.arange(len(self.constraints)), self.constraint_rows)
 
     @property
     def num_immobile_rows(self) -> int:
@@ -244,10 +255,12 @@ class Topology:
     def read_by_rows(self) -> tuple[np.ndarray, ...]:
         """Indices in v of the speeds that each loop row can depend on."""
         around = [self.read_by_joint(name) for name in self.joints[self.num_bodies :]]
+        moving = lambda bodies: [self._moving(self.path[body]) for body in bodies]
         of_constraints = [
-            np.unique([*map(self.column, terms), *(c for body in bodies for c in self._moving(self.path[body]))])
+            np.unique(np.concatenate([*map(self.columns_of, terms), *moving(bodies)]))
             for terms, bodies in zip(self.constraint_terms, self.constraint_bodies, strict=True)
         ]
+        of_constraints = [of_constraints[constraint] for constraint in self.constraint_of_row]
         plain = [cut for cut, *_ in (*self.rotation_rows, *self.translation_rows)]
         return (*(around[cut] for cut in (*plain, *self.combining)), *(found.astype(int) for found in of_constraints))
 

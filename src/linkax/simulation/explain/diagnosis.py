@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.equations.configuration import configure
+from linkax.equations.constraint_rows import constraint_gamma, constraint_rate, constraint_residual
 from linkax.equations.dynamics import mass_matrix
 from linkax.equations.gaps import gaps
 from linkax.equations.loops import jacobian, residual
@@ -38,7 +39,7 @@ def cause(solution: Solution) -> str:
     method = solution.run.tangent_space.prepared(state.q.dtype)
     result, t = solution.result, solution.t_end
     if result == RESULTS.not_finite:
-        return _not_finite(solution.mechanism) or _forces(solution, system, t, state) or _laws(solution.mechanism, t)
+        return _not_finite(solution.mechanism) or _forces(solution, system, t, state) or _laws(system, t, state)
     if result == RESULTS.not_closed:
         return _open(system, solution.mechanism, t, method.close(system, t, state.q, state.v)[0])
     if result == RESULTS.massless:
@@ -79,13 +80,16 @@ def _forces(solution, system, t, state):
     return ""
 
 
-def _laws(mechanism, t):
-    """Name a constraint whose function of time, or one of its first two derivatives, is not finite."""
-    for constraint in mechanism.constraints:
-        rate = jax.jacfwd(constraint.right_side)
-        if not all(bool(jnp.isfinite(law(t))) for law in (constraint.right_side, rate, jax.jacfwd(rate))):
-            when = f"at t = {float(t):.6g} s"
-            return f" The function of {constraint.display_name}, or a derivative of it, is not finite {when}."
+def _laws(system, t, state):
+    """Name a constraint whose residual, or one of its first two derivatives, is not finite."""
+    if not system.constraints:
+        return ""
+    motion = move(configure(system, jnp.asarray(t), state.q), state.v)
+    at = motion.configuration
+    rows = np.sum([constraint_residual(at), constraint_rate(at), constraint_gamma(motion, 1.0)], axis=0)
+    for row in np.flatnonzero(~np.isfinite(rows)):
+        name = system.constraints[system.topology.constraint_of_row[row]].display_name
+        return f" The function of {name}, or a derivative of it, is not finite at t = {float(t):.6g} s."
     return ""
 
 
@@ -148,7 +152,7 @@ def _open(system, mechanism, t, q):
 def _widest(system, mechanism, t, q):
     """The joint or constraint that is open widest, and by how much."""
     gap, topology = gaps(configure(system, t, q)).in_scales(system), mechanism.topology
-    names = [*topology.joints[topology.num_bodies :], *topology.constraints]
+    names = [*topology.joints[topology.num_bodies :], *(topology.constraints[c] for c in topology.constraint_of_row)]
     sizes = np.concatenate([np.maximum(gap.distance, gap.angle), gap.constraints])
     widest = int(np.argmax(sizes))
     return names[widest], float(sizes[widest])

@@ -134,8 +134,10 @@ def is_constraint(solution: Solution, name: str) -> bool:
 
 
 def of_constraint(function: Callable[..., Any], solution: Solution, name: str) -> Shaped[Array, "..."]:
-    """Read a function of constraints' forces for one of them."""
-    return read_in_motion(function, solution)[..., solution.mechanism.topology.constraints.index(name)]
+    """Read a function of constraints' forces for one of them: (n_t,), or (n_t, k) where it has several rows."""
+    topology = solution.mechanism.topology
+    rows = np.flatnonzero(topology.constraint_of_row == topology.constraints.index(name))
+    return read_in_motion(function, solution)[..., rows[0] if len(rows) == 1 else rows]
 
 
 def _index(solution, section) -> Int[np.ndarray, "*batch"]:

@@ -196,7 +196,7 @@ class Observables(NamedTuple):
 
     def unique_constraint_forces(self) -> Bool[Array, " k"]:
         topology = self.system.topology
-        rows = self._self_stresses()[0][:, topology.num_rows - len(topology.constraints) :]
+        rows = self._self_stresses()[0][:, topology.num_rows - topology.num_constraint_rows :]
         return jnp.max(jnp.abs(rows), axis=0, initial=0.0) <= UNCHANGED
 
     def energies(self) -> tuple[Float[Array, ""], Scalar]:
@@ -219,8 +219,10 @@ class Observables(NamedTuple):
 
     def powers_of_drives(self) -> Float[Array, " n"]:
         """Of each of the constraints that `do_work`."""
-        of_rows, (_, driven) = self.solved.multipliers * rate(self.system, self.t), do_work(self.system)
-        return of_rows[len(of_rows) - len(self.system.constraints) + np.array(driven, int)]
+        of_rows, (_, driven) = self.solved.multipliers * rate(self.configuration), do_work(self.system)
+        of_rows, topology = of_rows[len(of_rows) - self.system.topology.num_constraint_rows :], self.system.topology
+        of_driven = np.array(driven, int)[:, None] == topology.constraint_of_row
+        return jnp.sum(jnp.where(of_driven, of_rows, 0.0), axis=1)
 
     def power(self) -> Power:
         return Power(jnp.sum(self.powers_of_forces()), jnp.sum(self.powers_of_drives()))
@@ -245,7 +247,7 @@ class Observables(NamedTuple):
         """The violation, and the largest speed and acceleration of the joints [1/s, 1/s²]."""
         configuration = self.configuration
         position = jnp.concatenate([residual(configuration), immobile_residual(configuration)])
-        velocity = jacobian(configuration) @ self.v - rate(self.system, self.t)
+        velocity = jacobian(configuration) @ self.v - rate(configuration)
         violation = Violation(*map(largest, (position, velocity, self.solved.violation)))
         speed = self.system.fastest(self.v)
         return violation, speed, jnp.maximum(self.system.fastest(self.solved.acceleration), speed**2)

@@ -118,7 +118,7 @@ def _on_branch_jvp(primals, tangents):
 def _asked(configuration, held):
     system = configuration.system
     split = ConstraintSplit.of(configuration, rank_tolerance(system.dtype))
-    right = jnp.concatenate([rate(system, configuration.t), held.flat()])
+    right = jnp.concatenate([rate(configuration), held.flat()])
     scale = lax.stop_gradient(positive_or_one(largest(right)))
     of_held = lambda v: held.speeds(move(configuration, v))
     rows = jnp.concatenate([split.jacobian, held.slopes(of_held, system.topology, system.dtype)])

@@ -109,7 +109,8 @@ def _open(mechanism, state, t, remainder) -> Iterator[str]:
         for size, in_scales, unit in ((gap.distance, scaled.distance, "m"), (gap.angle, scaled.angle, "rad")):
             if not in_scales[cut] <= CLOSED:
                 yield f"joint {name!r} does not close: {remains(size[cut], unit)}; {advice}"
-    for constraint, size, in_scales in zip(mechanism.constraints, gap.constraints, scaled.constraints, strict=True):
+    for row, size, in_scales in zip(topology.constraint_of_row, gap.constraints, scaled.constraints, strict=True):
+        constraint = mechanism.constraints[row]
         if not in_scales <= CLOSED:
             joints = f" of joint {', '.join(map(repr, constraint.joints))}" if constraint.joints else ""
             yield (
