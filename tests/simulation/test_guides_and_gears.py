@@ -121,6 +121,7 @@ def lifted(height):
     return shaken(height).reaction("shaker")[4, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", [circled, lifted])
 def test_derivatives(function):
     at, step = 0.5, 1e-5
