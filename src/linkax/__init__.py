@@ -56,6 +56,8 @@ from linkax.model.bodies import point_mass as point_mass  # noqa: E402
 from linkax.model.constraints import AbstractConstraint as AbstractConstraint  # noqa: E402
 from linkax.model.constraints import Coupling as Coupling  # noqa: E402
 from linkax.model.constraints import Drive as Drive  # noqa: E402
+from linkax.model.curves import PeriodicSpline as PeriodicSpline  # noqa: E402
+from linkax.model.curves import SplineCurve as SplineCurve  # noqa: E402
 from linkax.model.forces import AbstractForce as AbstractForce  # noqa: E402
 from linkax.model.forces import Gravity as Gravity  # noqa: E402
 from linkax.model.forces import Load as Load  # noqa: E402
@@ -68,6 +70,9 @@ from linkax.model.joint_forces import JointFriction as JointFriction  # noqa: E4
 from linkax.model.joint_forces import JointSpring as JointSpring  # noqa: E402
 from linkax.model.joint_forces import JointTorque as JointTorque  # noqa: E402
 from linkax.model.joints.bending import Sliding as Sliding  # noqa: E402
+from linkax.model.joints.cam import Cam as Cam  # noqa: E402
+from linkax.model.joints.constant_velocity import ConstantVelocity as ConstantVelocity  # noqa: E402
+from linkax.model.joints.curve import CurveJoint as CurveJoint  # noqa: E402
 from linkax.model.joints.cylindrical import Cylindrical as Cylindrical  # noqa: E402
 from linkax.model.joints.distance import Distance as Distance  # noqa: E402
 from linkax.model.joints.fixed import Fixed as Fixed  # noqa: E402

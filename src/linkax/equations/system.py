@@ -13,6 +13,7 @@ from jaxtyping import Float
 from linkax.equations.structure import Structure, structure_of
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.joints.joint import RelativeMotion
+from linkax.model.joints.table_joint import TableJoint
 from linkax.model.mechanism import Mechanism
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import largest
@@ -128,7 +129,7 @@ def _stacked(mechanism, dtype, fixed_scales) -> System:
             else None
             for kind in topology.joint_groups
         ),
-        joint_parameter=stack([0.0 if joint.parameter is None else joint.parameter for joint in joints], ()),
+        joint_parameter=stack([joint.parameter if isinstance(joint, TableJoint) else 0.0 for joint in joints], ()),
         loop_length=loop_length,
         length=length,
         constraint_scales=fixed(stack(constraint_scales, ())),

@@ -1,5 +1,6 @@
 """Take beams apart into rigid sections, the joints between them, and their elastic forces."""
 
+import copy
 from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -13,7 +14,8 @@ from linkax.model.bodies import Frame, RigidBody
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import AbstractForce
 from linkax.model.joints.bending import BeamSegment, OnBeam, SleevePart, Sliding
-from linkax.model.joints.joint import AbstractJoint
+from linkax.model.joints.fixed import Fixed
+from linkax.model.joints.joint import AbstractJoint, JointKind
 from linkax.model.numbers import rotation_matrix
 from linkax.xla.arrays import ScalarLike
 
@@ -64,6 +66,24 @@ def discretise_beams(
         [*forces, *map(BeamElasticity, beams.values())],
         constraints,
     )
+
+
+def is_split(joint: AbstractJoint) -> bool:
+    """Tell whether a joint that closes a loop goes into the tree, with a massless body between it and its child."""
+    return isinstance(joint.kind, JointKind) and not isinstance(joint, OnBeam)
+
+
+def split_cuts(parts: Parts, cuts: Iterable[AbstractJoint]) -> Parts:
+    """Put the joints with a motion of their own that are cut into the tree: a weld closes each loop in their place."""
+    bodies, joints = [*parts.bodies], {joint.name: [joint] for joint in parts.joints}
+    for joint in filter(is_split, cuts):
+        end = RigidBody(f"{joint.name} (end)", 0.0)
+        carrier = copy.copy(joint)
+        for name, entry in (("child", end.reference), ("cut", False)):
+            object.__setattr__(carrier, name, entry)
+        bodies.append(end)
+        joints[joint.name] = [carrier, Fixed(f"{joint.name} (closed)", end, joint.child, cut=True)]
+    return parts._replace(bodies=bodies, joints=[joint for own in joints.values() for joint in own])
 
 
 def tree_joints_first(joints: Iterable[AbstractJoint]) -> list[set[str]]:

@@ -6,12 +6,13 @@ rotations given as names or numbers), never traced ones.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.joints.joint import AbstractJoint
+from linkax.model.joints.table_joint import TableJoint
 from linkax.model.numbers import Constant
 from linkax.model.spanning_tree import SpanningTree
 
@@ -30,7 +31,7 @@ def is_planar(mechanism: Mechanism) -> bool:
     ends = (*topology.bodies, GROUND_NAME)  # ground has the index -1
     predecessors = [ends[index] for index in topology.predecessor]
     orientation, _ = _tree_of(mechanism.joints[: topology.num_bodies], predecessors)
-    joints = [joint for joint in mechanism.joints if joint.speed_units or joint.locked_rotations]
+    joints = [joint for joint in mechanism.joints if joint.speed_units or getattr(joint, "locked_rotations", ())]
     found = _directions(joints, orientation)
     if found is None:
         return False
@@ -44,7 +45,7 @@ def split_rows(tree: SpanningTree, all_rows: bool = False) -> dict[str, tuple]:
     """Sort the rows of all cut joints by whether motion changes them (see `Topology`); by `all_rows` all move."""
     orientation, carrier_of = _tree_of(tree.carriers, tree.predecessors)
     rows = {"rotation_rows": [], "translation_rows": [], "immobile_rotation_rows": [], "immobile_translation_rows": []}
-    for index, cut in enumerate(tree.cuts):
+    for index, cut in enumerate(cast(list[TableJoint], tree.cuts)):
         rotates, translates = EVERY_ROW if all_rows else _mobile(cut, _loop(cut, carrier_of), orientation)
         for i, j in cut.locked_rotations:
             rows["rotation_rows" if rotates(i, j) else "immobile_rotation_rows"].append((index, i, j))

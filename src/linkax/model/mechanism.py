@@ -3,7 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 
@@ -11,7 +11,7 @@ from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
 from linkax.model.constraints import AbstractConstraint, LinearConstraint
 from linkax.model.description import described
-from linkax.model.discretisation import Parts, discretise_beams, tree_joints_first
+from linkax.model.discretisation import Parts, discretise_beams, is_split, split_cuts, tree_joints_first
 from linkax.model.forces import AbstractForce, given_name
 from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
@@ -69,6 +69,10 @@ class Mechanism(eqx.Module):
         parts = discretise_beams(*given)
         body_by_name = _check_names(parts)
         tree = _spanning_tree(list(body_by_name), parts)
+        if any(is_split(joint) for joint in tree.cuts):
+            parts = split_cuts(parts, tree.cuts)
+            body_by_name = _check_names(parts)
+            tree = _spanning_tree(list(body_by_name), parts)
         self.bodies = read_only(tuple(body_by_name[name] for name in tree.bodies))
         self.beams = read_only(tuple(body for body in given[0] if isinstance(body, Beam)))
         self.joints = read_only((*tree.carriers, *tree.cuts))
@@ -192,7 +196,7 @@ def _topology(tree: SpanningTree, constraints: list[AbstractConstraint], all_row
         predecessor=tuple(index[name] for name in tree.predecessors),
         parent=tuple(index[joint.parent.body] for joint in joints),
         child=tuple(index[joint.child.body] for joint in joints),
-        joint_types=tuple(joint.kind for joint in joints),
+        joint_types=tuple(cast(Any, joint.kind) for joint in joints),
         driven_by=tuple(joint.driven_by for joint in joints),
         **split_rows(tree, all_rows),
         constraints=tuple(constraint.name for constraint in constraints),

@@ -9,6 +9,7 @@ import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
+from linkax.model.joints.table_joint import TableJoint
 from linkax.model.names import ByName, find
 from linkax.model.terms import Term
 
@@ -23,7 +24,7 @@ class JointGroup(NamedTuple):
     - `coordinates`: indices in q of the coordinates that move each, (n, k).
     """
 
-    motion: type[AbstractJoint] | RelativeMotion
+    motion: type[TableJoint] | RelativeMotion
     bodies: tuple[int, ...]
     coordinates: np.ndarray
 
@@ -56,7 +57,7 @@ class Topology:
     predecessor: tuple[int, ...]
     parent: tuple[int, ...]
     child: tuple[int, ...]
-    joint_types: tuple[type[AbstractJoint] | JointKind, ...]
+    joint_types: tuple[type[TableJoint] | JointKind, ...]
     driven_by: tuple[tuple[Term, ...] | None, ...]
     rotation_rows: tuple[tuple[int, int, int], ...]
     translation_rows: tuple[tuple[int, int], ...]
@@ -93,9 +94,9 @@ class Topology:
         return find(name, self.joints, "joint")
 
     @cached_property
-    def cut_types(self) -> tuple[type[AbstractJoint], ...]:
+    def cut_types(self) -> tuple[type[TableJoint], ...]:
         """The classes of the cut joints."""
-        return cast(tuple[type[AbstractJoint], ...], self.joint_types[self.num_bodies :])
+        return cast(tuple[type[TableJoint], ...], self.joint_types[self.num_bodies :])
 
     @property
     def num_cuts(self) -> int:
@@ -139,7 +140,7 @@ class Topology:
         """Where the speeds of each tree joint lie in v."""
         return self._slices(lambda kind: len(kind.speed_units))
 
-    def _slices(self, count: Callable[[type[AbstractJoint] | JointKind], int]) -> dict[str, slice]:
+    def _slices(self, count: Callable[[type[TableJoint] | JointKind], int]) -> dict[str, slice]:
         slices, start = {}, 0
         for name, kind in zip(self.joints[: self.num_bodies], self.joint_types, strict=False):
             slices[name] = slice(start, start + count(kind))
@@ -221,7 +222,8 @@ class Topology:
         of_motion = {}
         for body, kind in enumerate(self.joint_types[: self.num_bodies]):
             driven_by = self.driven_by[body]
-            alike = (kind, None) if driven_by is None else (kind.motion, len(driven_by))
+            count = len(kind.speed_units if driven_by is None else driven_by)
+            alike = (kind, None) if kind.motion is None else (kind.motion, count)
             of_motion.setdefault(alike, []).append(body)
         return tuple(
             JointGroup(motion, tuple(bodies), self._read_by(bodies)) for (motion, _), bodies in of_motion.items()

@@ -100,10 +100,6 @@ class OnBeam(AbstractJoint):
     - `element`: the element, from 0.
     """
 
-    locked_rotations = ()
-    locked_translations = ()
-    aligned_axes = ()
-
     beam: str = eqx.field(static=True)
     strains: tuple[int, ...] = eqx.field(static=True)
     elements: int = eqx.field(static=True)
@@ -137,13 +133,8 @@ class OnBeam(AbstractJoint):
         across = [3 - strain for strain in bends]
         return tuple(map(tuple, np.eye(3)[sorted({*stretches, *across, *(0 for _ in bends)})]))
 
-    @staticmethod
-    def rotation(coordinates: Any) -> NoReturn:
-        raise NotImplementedError("joints of a beam have a `motion`")
-
-    @staticmethod
-    def measure(rotation: Any, separation: Any) -> NoReturn:
-        raise NotImplementedError("joints of a beam are never cut")
+    def transform(self, coordinates: Any) -> NoReturn:
+        raise NotImplementedError("joints of a beam move by its strains")
 
 
 class BeamSegment(OnBeam):

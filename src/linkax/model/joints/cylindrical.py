@@ -2,12 +2,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from linkax.model.joints.joint import AbstractJoint, hinged
+from linkax.model.joints.table_joint import TableJoint, hinged
 from linkax.spatial.rotations import angle_about_first_axis
 from linkax.xla.arrays import Array
 
 
-class Cylindrical(AbstractJoint):
+class Cylindrical(TableJoint):
     """A sleeve on a shaft: the child turns about h¹ and slides along it.
 
     Coordinates: angle [rad] from the parent's h² to the child's, right-handed about h¹, and
@@ -22,7 +22,7 @@ class Cylindrical(AbstractJoint):
     aligned_axes = (0,)
     locked_translations = (1, 2)
 
-    __init__ = AbstractJoint.__init__
+    __init__ = TableJoint.__init__
 
     rotation = staticmethod(hinged)
 

@@ -3,12 +3,12 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame
-from linkax.model.joints.joint import AbstractJoint, unturned
+from linkax.model.joints.table_joint import TableJoint, unturned
 from linkax.model.numbers import Number, positive
 from linkax.xla.arrays import Array, Scalar
 
 
-class Distance(AbstractJoint):
+class Distance(TableJoint):
     """A massless rod with a ball at each end, or a rope that stays taut, between two points.
 
     It keeps the origins of two frames `length` apart and has no coordinate. It carries no body: each body needs

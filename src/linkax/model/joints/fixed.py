@@ -3,11 +3,11 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame
-from linkax.model.joints.joint import AbstractJoint, unturned
+from linkax.model.joints.table_joint import TableJoint, unturned
 from linkax.xla.arrays import Array
 
 
-class Fixed(AbstractJoint):
+class Fixed(TableJoint):
     """A weld: the child keeps its position and orientation on the parent. It has no coordinate."""
 
     speed_units = ()

@@ -3,12 +3,12 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame
-from linkax.model.joints.joint import AbstractJoint
+from linkax.model.joints.table_joint import TableJoint
 from linkax.spatial.quaternions import from_rotation_matrix, rotation_matrix
 from linkax.xla.arrays import Array
 
 
-class Free(AbstractJoint):
+class Free(TableJoint):
     """No constraint: the child moves freely, and its motion is measured from the parent.
 
     Coordinates: unit quaternion (w, x, y, z) of the child's frame in the parent's, and the position

@@ -2,19 +2,20 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
 from linkax.model.numbers import Axis, Constant, perpendicular_axes, require_bool, unit_axis, value
 from linkax.model.terms import Term
-from linkax.spatial.rotations import frame_about_axis, rotation_about_first_axis
-from linkax.xla.arrays import Array, Scalar, ScalarLike
+from linkax.spatial.rotations import frame_about_axis
+from linkax.spatial.vectors import length
+from linkax.xla.arrays import Array, ScalarLike
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +34,7 @@ class RelativeMotion(abc.ABC):
 class JointKind:
     """What a topology keeps of a joint in the tree that has a `RelativeMotion`, compared by value.
 
-    Its attributes are those that other joints have as class attributes, see `AbstractJoint`.
+    Its attributes are those that other joints have as class attributes, see `linkax.model.joints.table_joint`.
     """
 
     name: str
@@ -53,41 +54,22 @@ class JointKind:
 
 
 class AbstractJoint(eqx.Module):
-    """A joint between a frame on a parent and a frame on a child body.
+    """A joint between a frame on a parent and a frame on a child body. To make your own, define `transform`.
 
     Both frames have the same orientation at coordinate zero. The joint's axes h¹, h², h³ are fixed in each of
-    them, with h¹ along `axis`, given in the parent's frame. Coordinates and speeds are those of the child relative to
-    the parent: turns first, then displacements.
+    them, with h¹ along `axis`, given in the parent's frame; along "x" they are x, y, z. Coordinates and speeds are
+    those of the child relative to the parent: turns first, then displacements.
 
-    A joint type is a subclass that fills in the class attributes. In the spanning tree it turns the child by
-    `rotation` and moves it along `linear_subspace`, both in joint axes. Cut, it locks `locked_rotations` and
-    `locked_translations` (Table 1 of the paper), and `measure` reads its coordinates. A type without numbers of its
-    own sets `__init__ = AbstractJoint.__init__`; otherwise type checkers take its fields for arguments.
+    A joint type is a subclass with `speed_units` and a `transform`, from which JAX derives motion subspace and
+    accelerations. Its fields that hold numbers are traced. Where it closes a loop, a massless body is put between it
+    and its child, so that its coordinates count on. The reaction of a joint of one's own is all that it carries, its
+    own force included.
     """
 
     # Units of the speeds, one for each: "rad" or "m" (per second).
     speed_units: ClassVar[tuple[str, ...]]
     # Coordinates begin with a unit quaternion, whose rate is the angular velocity of the first three speeds.
     has_quaternion: ClassVar[bool] = False
-    # Columns of the motion subspace in joint axes of the parent, angular and linear part. With an
-    # `angular_subspace_at` the angular part is that at coordinate zero.
-    angular_subspace: ClassVar[tuple[tuple[float, float, float], ...]]
-    linear_subspace: ClassVar[tuple[tuple[float, float, float], ...]]
-    # Whether the linear part is multiplied by `parameter`.
-    is_screw: ClassVar[bool] = False
-    # Angular part of a joint whose axes turn with its own coordinates: (coordinates) -> (n, 3).
-    angular_subspace_at: ClassVar[Callable[[Array], jax.Array] | None] = None
-    # All of the motion of a joint that moves with other coordinates than its own, see `RelativeMotion`.
-    motion: ClassVar[RelativeMotion | None] = None
-    # Pairs (i, j), counted from 0, of axes that stay orthogonal: parent's hⁱ and child's hʲ.
-    locked_rotations: ClassVar[tuple[tuple[int, int], ...]]
-    # Axes, counted from 0, that point the same way on both; locked rotations alone allow a flip.
-    aligned_axes: ClassVar[tuple[int, ...]]
-    # Axes of the parent, counted from 0, along which the frames do not separate.
-    locked_translations: ClassVar[tuple[int, ...]]
-    # One row more, of h₁ⁱ·h₂ʲ for these pairs and h₁ⁱ·s/ℓ for these axes together, by `combined`.
-    combined_rotations: ClassVar[tuple[tuple[int, int], ...]] = ()
-    combined_translations: ClassVar[tuple[int, ...]] = ()
     # False for a type that only closes loops.
     can_carry: ClassVar[bool] = True
 
@@ -135,6 +117,15 @@ class AbstractJoint(eqx.Module):
             self.axis, self.second_axis = perpendicular_axes(self.axis, second_axis, what)
         self.cut = require_bool(cut, f"joint {name!r}: cut")
 
+    @abc.abstractmethod
+    def transform(self, coordinates: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+        """Compute the child's frame in the parent's at coordinates [rad or m], twice differentiable by JAX.
+
+        It may read the fields of its own class.
+
+        **Returns:** its axes as columns, (3, 3), and its origin [m], (3,), both in joint axes of the parent.
+        """
+
     @property
     def num_coordinates(self) -> int:
         """Number of coordinates: one for each speed, and one more with a quaternion."""
@@ -142,8 +133,8 @@ class AbstractJoint(eqx.Module):
 
     @property
     def kind(self) -> "type[AbstractJoint] | JointKind":
-        """What a topology keeps of this joint: its class, or a `JointKind`."""
-        return type(self)
+        """What a topology keeps of this joint: its class, where that says all, or a `JointKind`."""
+        return JointKind(type(self).__name__, Transform.of(self), self.speed_units)
 
     @property
     def driven_by(self) -> tuple[Term, ...] | None:
@@ -153,17 +144,12 @@ class AbstractJoint(eqx.Module):
     @property
     def parameters(self) -> Float[Array, " k"] | None:
         """Numbers that its `motion` needs."""
-        return None
+        return own_numbers(self)
 
     @property
     def length_estimate(self) -> ScalarLike:
-        """Estimate of how far its `motion` takes the child from the parent [m]."""
-        return 0.0
-
-    @property
-    def parameter(self) -> Scalar | None:
-        """A length [m] that its rows or its motion need, such as a screw's pitch [m/rad], or None."""
-        return None
+        """Estimate of how far it takes the child from the parent [m]; by default at coordinates of one."""
+        return length(self.transform(jnp.ones(self.num_coordinates))[1])
 
     def frames(self) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Return h¹, h², h³ as columns, in the parent's and in the child's body axes."""
@@ -171,29 +157,71 @@ class AbstractJoint(eqx.Module):
         axes = frame_about_axis(value(self.axis), second)
         return value(self.parent.rotation) @ axes, value(self.child.rotation) @ axes
 
-    @staticmethod
-    @abc.abstractmethod
-    def rotation(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
-        """Compute the child's axes in those of the parent, as columns, from the coordinates."""
+    @property
+    def angular_subspace(self) -> tuple[tuple[float, float, float], ...]:
+        """Axes about which it can turn its child, in joint axes, as columns; by default any."""
+        return tuple(map(tuple, np.eye(3)))
+
+    @property
+    def linear_subspace(self) -> tuple[tuple[float, float, float], ...]:
+        """Directions in which it can move its child, likewise."""
+        return tuple(map(tuple, np.eye(3)))
+
+
+# What each joint has, besides what its own class adds.
+COMMON = tuple(field.name for field in dataclasses.fields(AbstractJoint))
+
+
+@dataclasses.dataclass(frozen=True)
+class Transform(RelativeMotion):
+    """The motion of a joint by its `transform`; parameters are the numbers among the fields of its own class.
+
+    - `of_type`: its class. `static`: the names and values of fields that are no pytrees.
+    - `structure`, `fixed`: the other fields as a pytree, and its leaves that are no numbers.
+    - `shapes`: of the leaves that are numbers, None for others.
+    """
+
+    of_type: type[AbstractJoint]
+    static: tuple[tuple[str, Any], ...]
+    structure: Any
+    fixed: tuple[Any, ...]
+    shapes: tuple[tuple[int, ...] | None, ...]
 
     @staticmethod
-    @abc.abstractmethod
-    def measure(rotation: Float[Array, "3 3"], separation: Float[Array, "3"]) -> Float[Array, " n"]:
-        """Read the coordinates from the child's axes and origin, both in joint axes of the parent."""
+    def of(joint: AbstractJoint) -> "Transform":
+        """Take it from a joint."""
+        own = [field for field in dataclasses.fields(joint) if field.name not in COMMON]
+        static = tuple((field.name, getattr(joint, field.name)) for field in own if field.metadata.get("static"))
+        leaves, structure = jax.tree.flatten(_traced_fields(joint))
+        fixed = tuple(None if _is_number(leaf) else leaf for leaf in leaves)
+        shapes = tuple(np.shape(leaf) if _is_number(leaf) else None for leaf in leaves)
+        return Transform(type(joint), static, structure, fixed, shapes)
 
-    @staticmethod
-    def combined(
-        rotations: Float[Array, " r"], translations: Float[Array, " t"], parameter: Scalar
-    ) -> Float[jax.Array, ""]:
-        """Combine h₁ⁱ·h₂ʲ and h₁ⁱ·s/ℓ into one row; `parameter` is the joint's own, in units of ℓ."""
-        raise NotImplementedError
+    def __call__(self, coordinates: Float[Array, " n"], parameters: Float[Array, " k"]) -> Float[jax.Array, "4 4"]:
+        leaves, start = [], 0
+        for fixed, shape in zip(self.fixed, self.shapes, strict=True):
+            size = 0 if shape is None else int(np.prod(shape))
+            leaves.append(fixed if shape is None else parameters[start : start + size].reshape(shape))
+            start += size
+        joint = object.__new__(self.of_type)
+        for name, entry in (*self.static, *jax.tree.unflatten(self.structure, leaves).items()):
+            object.__setattr__(joint, name, entry)
+        rotation, position = joint.transform(coordinates)
+        found = jnp.eye(4, dtype=coordinates.dtype)
+        return found.at[:3, :3].set(rotation).at[:3, 3].set(position)
 
 
-def hinged(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
-    """Rotate about h¹ by the first coordinate."""
-    return rotation_about_first_axis(coordinates[0])
+def _traced_fields(joint):
+    """Fields of a joint's own class that are pytrees."""
+    own = [field for field in dataclasses.fields(joint) if field.name not in COMMON]
+    return {field.name: getattr(joint, field.name) for field in own if not field.metadata.get("static")}
 
 
-def unturned(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:
-    """Do not rotate."""
-    return jnp.eye(3, dtype=coordinates.dtype)
+def own_numbers(joint: AbstractJoint) -> Float[Array, " k"]:
+    """Numbers among the fields of a joint's own class, in one array."""
+    numbers = [jnp.ravel(jnp.asarray(leaf)) for leaf in jax.tree.leaves(_traced_fields(joint)) if _is_number(leaf)]
+    return jnp.concatenate([jnp.zeros(0), *numbers])
+
+
+def _is_number(leaf):
+    return isinstance(leaf, float) or eqx.is_inexact_array(leaf)

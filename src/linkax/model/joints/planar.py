@@ -2,12 +2,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from linkax.model.joints.joint import AbstractJoint, hinged
+from linkax.model.joints.table_joint import TableJoint, hinged
 from linkax.spatial.rotations import angle_about_first_axis
 from linkax.xla.arrays import Array
 
 
-class Planar(AbstractJoint):
+class Planar(TableJoint):
     """A plate on a table: the child slides in the plane across h¹, and turns about h¹.
 
     Coordinates: angle [rad] from the parent's h² to the child's, right-handed about h¹, and the
@@ -26,7 +26,7 @@ class Planar(AbstractJoint):
     aligned_axes = (0,)
     locked_translations = (0,)
 
-    __init__ = AbstractJoint.__init__
+    __init__ = TableJoint.__init__
 
     rotation = staticmethod(hinged)
 

@@ -1,10 +1,10 @@
 from jaxtyping import Float
 
-from linkax.model.joints.joint import AbstractJoint, unturned
+from linkax.model.joints.table_joint import TableJoint, unturned
 from linkax.xla.arrays import Array
 
 
-class Prismatic(AbstractJoint):
+class Prismatic(TableJoint):
     """A slide: the child moves along h¹ without turning.
 
     Coordinate: distance [m] of the child's frame from the parent's along h¹.
@@ -17,7 +17,7 @@ class Prismatic(AbstractJoint):
     aligned_axes = (0, 1, 2)
     locked_translations = (1, 2)
 
-    __init__ = AbstractJoint.__init__
+    __init__ = TableJoint.__init__
 
     rotation = staticmethod(unturned)
 

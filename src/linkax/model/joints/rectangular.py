@@ -1,10 +1,10 @@
 from jaxtyping import Float
 
-from linkax.model.joints.joint import AbstractJoint, unturned
+from linkax.model.joints.table_joint import TableJoint, unturned
 from linkax.xla.arrays import Array
 
 
-class Rectangular(AbstractJoint):
+class Rectangular(TableJoint):
     """A cross slide: the child moves in the plane across h¹ without turning.
 
     With a `lx.point_mass` as child it is a point that moves in a plane. Coordinates: distances [m] of the child's
@@ -24,7 +24,7 @@ class Rectangular(AbstractJoint):
     aligned_axes = (0, 1, 2)
     locked_translations = (0,)
 
-    __init__ = AbstractJoint.__init__
+    __init__ = TableJoint.__init__
 
     rotation = staticmethod(unturned)
 

@@ -1,12 +1,12 @@
 import jax
 from jaxtyping import Float
 
-from linkax.model.joints.joint import AbstractJoint, hinged
+from linkax.model.joints.table_joint import TableJoint, hinged
 from linkax.spatial.rotations import angle_about_first_axis
 from linkax.xla.arrays import Array
 
 
-class Revolute(AbstractJoint):
+class Revolute(TableJoint):
     """A hinge: the child turns about h¹.
 
     Coordinate: angle [rad] from the parent's h² to the child's, right-handed about h¹; in (−π, π] where the
@@ -20,7 +20,7 @@ class Revolute(AbstractJoint):
     aligned_axes = (0,)
     locked_translations = (0, 1, 2)
 
-    __init__ = AbstractJoint.__init__
+    __init__ = TableJoint.__init__
 
     rotation = staticmethod(hinged)
 

@@ -4,13 +4,13 @@ from jax import lax
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame
-from linkax.model.joints.joint import AbstractJoint, hinged
+from linkax.model.joints.table_joint import TableJoint, hinged
 from linkax.model.numbers import Axis, Number, number, require
 from linkax.spatial.rotations import angle_about_first_axis
 from linkax.xla.arrays import Array, Scalar
 
 
-class Screw(AbstractJoint):
+class Screw(TableJoint):
     """A nut on a screw: the child turns about h¹ and advances along it by pitch × angle.
 
     Coordinate: angle [rad] from the parent's h² to the child's, right-handed about h¹. `pitch` [m/rad] is the

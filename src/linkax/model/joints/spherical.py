@@ -2,12 +2,12 @@ import jax
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame
-from linkax.model.joints.joint import AbstractJoint
+from linkax.model.joints.table_joint import TableJoint
 from linkax.spatial.quaternions import from_rotation_matrix, rotation_matrix
 from linkax.xla.arrays import Array
 
 
-class Spherical(AbstractJoint):
+class Spherical(TableJoint):
     """A ball and socket: the child turns freely about the common origin of both frames.
 
     Coordinates: unit quaternion (w, x, y, z) of the child's frame in the parent's, (1, 0, 0, 0)

@@ -2,12 +2,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from linkax.model.joints.joint import AbstractJoint
+from linkax.model.joints.table_joint import TableJoint
 from linkax.spatial.rotations import compose, rotation_about_first_axis
 from linkax.xla.arrays import Array
 
 
-class Universal(AbstractJoint):
+class Universal(TableJoint):
     """A Cardan joint: the child turns about the parent's h¹, and then about its own h².
 
     Coordinates: the two angles [rad], right-handed about h¹ and h², in (−π, π] where
@@ -21,7 +21,7 @@ class Universal(AbstractJoint):
     aligned_axes = ()
     locked_translations = (0, 1, 2)
 
-    __init__ = AbstractJoint.__init__
+    __init__ = TableJoint.__init__
 
     @staticmethod
     def rotation(coordinates: Float[Array, " n"]) -> Float[jax.Array, "3 3"]:

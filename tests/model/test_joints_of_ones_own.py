@@ -1,0 +1,86 @@
+"""Joints that a user writes, by a transform, in the tree and closing loops."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+
+
+class Helix(lx.AbstractJoint):
+    """A nut on a helix of a radius and a rise per radian; its axes turn with it."""
+
+    speed_units = ("rad",)
+
+    radius: float
+    rise: float
+    turns: bool = eqx.field(static=True)
+
+    def __init__(self, name, parent, child, radius, rise, *, turns=True, cut=False):
+        super().__init__(name, parent, child, "x", cut=cut)
+        self.radius, self.rise, self.turns = radius, rise, turns
+
+    def transform(self, coordinates):
+        (angle,) = coordinates
+        c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
+        turned = jnp.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3)
+        place = jnp.stack([self.radius * (c - 1.0), self.radius * s, self.rise * angle])
+        return turned if self.turns else jnp.eye(3), place
+
+
+def sliding(radius, rise=0.1, **options):
+    bead = lx.RigidBody("bead", 2.0, inertia=[0.01, 0.01, 0.01])
+    return lx.Mechanism(
+        [bead], [Helix("wire", lx.GROUND, bead, radius, rise, **options)], [lx.Gravity([0.0, 0.0, -9.81])]
+    )
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_down_a_helix(turns):
+    """φ̈ = −m g h / (m (r² + h²) + I); the reaction is m (a − g) with a = −r φ̇² n + φ̈ (r t + h z)."""
+    mechanism = sliding(0.3, turns=turns)
+    found = lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0, accuracy=lx.PRECISE)
+    ts, inertia = np.asarray(found.ts), 0.01 if turns else 0.0
+    rate = -2.0 * 9.81 * 0.1 / (2.0 * (0.09 + 0.01) + inertia)
+    np.testing.assert_allclose(found.joint("wire"), rate * ts**2 / 2.0, atol=1e-10)
+    np.testing.assert_allclose(found.energy(), 0.0, atol=1e-9)
+    angle = rate * ts**2 / 2.0
+    c, s = np.cos(angle), np.sin(angle)
+    inward, along = -np.stack([c, s, 0.0 * s], -1), np.stack([-s, c, 0.0 * s], -1)
+    acceleration = 0.3 * ((rate * ts) ** 2)[:, None] * inward + rate * (0.3 * along + [0.0, 0.0, 0.1])
+    np.testing.assert_allclose(
+        found.reaction("wire").force, 2.0 * acceleration + np.array([0.0, 0.0, 19.62]), atol=1e-7
+    )
+
+
+def closed(radius):
+    """The bead of a helix between the ends of an arm and the world: its joint closes a loop."""
+    arm = lx.RigidBody("arm", 1.0, [0.1, 0.0, 0.0], [0.02, 0.03, 0.04])
+    bead = lx.RigidBody("bead", 2.0, inertia=[0.01, 0.01, 0.01])
+    joints = [
+        lx.Cylindrical("axle", lx.GROUND, arm, "z"),
+        lx.Fixed("tip", arm.at([0.3, 0.0, 0.0]), bead),
+        Helix("wire", lx.GROUND.at([0.3, 0.0, 0.0]), bead, radius, 0.1),
+    ]
+    return lx.Mechanism([arm, bead], joints, [lx.Gravity([0.0, 0.0, -9.81])])
+
+
+def test_in_a_loop():
+    mechanism = closed(0.3)
+    state = lx.assemble(mechanism, {"wire": 7.0})
+    assert lx.mobility(mechanism, state).degrees_of_freedom == 1
+    np.testing.assert_allclose(lx.Solution.of_state(mechanism, state).joint("wire"), 7.0, atol=1e-12)
+    found = lx.simulate(mechanism, state, t1=1.0)
+    rate = -3.0 * 9.81 * 0.1 / (3.0 * 0.01 + 2.0 * 0.09 + 0.04 + 0.01 + 0.01)
+    np.testing.assert_allclose(found.joint("wire"), 7.0 + rate * found.ts**2 / 2.0, rtol=1e-9)
+
+
+def test_derivatives():
+    reached = lambda radius: lx.simulate(
+        sliding(radius), lx.assemble(sliding(radius)), t1=1.0, saveat=diffrax.SaveAt(t1=True)
+    ).q[0, 0]
+    exact = 9.81 * 0.1 / (2.0 * (0.09 + 0.015) ** 2) * 2.0 * 0.3
+    np.testing.assert_allclose([jax.grad(reached)(0.3), jax.jacfwd(reached)(0.3)], exact, rtol=1e-9)
