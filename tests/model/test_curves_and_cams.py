@@ -98,6 +98,7 @@ def test_a_cycloidal_cam():
     np.testing.assert_allclose(found.joint("contact")[:, 0], angles, atol=1e-9)  # it counts turns
 
 
+@pytest.mark.slow
 def test_a_roller_on_an_eccentric():
     """s = e cos θ + √((R + r)² − e² sin² θ), the profile given as a spline."""
     eccentric, radius, roller = 0.01, 0.04, 0.015
