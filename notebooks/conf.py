@@ -31,7 +31,7 @@ autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 
 # What linkax makes and its users read, without signature; named tuples are such too, but for those that users make.
-READ = {"Attached", "Frame", "Load", "Mobility", "Motion", "Solution", "View"}
+READ = {"Attached", "Frame", "Load", "Mobility", "Motion", "Moving", "Solution", "View"}
 WRITTEN = {"Inertia", "Pose", "Stepping", "Velocity"}
 # Classes whose methods users call; those of others are for linkax, as it moves joints and adds up forces.
 CALLED = {
@@ -44,6 +44,7 @@ CALLED = {
     "Mechanism",
     "Mobility",
     "Motion",
+    "Moving",
     "RigidBody",
     "Solution",
 }
@@ -61,7 +62,7 @@ INTERNAL = {
 }
 INTERNAL |= {"fastest_frequency", "nodes", "sections", "section_name", "needs_coordinate", "display_name"}
 INTERNAL |= {"conserves_energy", "switched", "side", "applied", "held"}
-INTERNAL |= {"checked_residual", "check_residual", "row_scales", "pose", "coordinate"}
+INTERNAL |= {"checked_residual", "check_residual", "checked_slip", "num_rows", "row_scales", "pose", "coordinate"}
 
 
 def described(name):

@@ -47,6 +47,7 @@ from linkax.formulations.projection_operator import ProjectionOperator as Projec
 from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402
 from linkax.linalg.pivoted_qr import pivoted_qr as pivoted_qr  # noqa: E402
 from linkax.model.attached import Attached as Attached  # noqa: E402
+from linkax.model.attached import Moving as Moving  # noqa: E402
 from linkax.model.beams import Beam as Beam  # noqa: E402
 from linkax.model.bodies import GROUND as GROUND  # noqa: E402
 from linkax.model.bodies import Frame as Frame  # noqa: E402
@@ -95,6 +96,9 @@ from linkax.model.poses import Pose as Pose  # noqa: E402
 from linkax.model.poses import Velocity as Velocity  # noqa: E402
 from linkax.model.rods import rod as rod  # noqa: E402
 from linkax.model.rods import rod_between as rod_between  # noqa: E402
+from linkax.model.rolling import RollingDisc as RollingDisc  # noqa: E402
+from linkax.model.rolling import RollingSphere as RollingSphere  # noqa: E402
+from linkax.model.rolling import Skate as Skate  # noqa: E402
 from linkax.model.ropes import ElasticRope as ElasticRope  # noqa: E402
 from linkax.model.ropes import Rope as Rope  # noqa: E402
 from linkax.model.sections import Material as Material  # noqa: E402

@@ -137,11 +137,13 @@ def row_names(topology: Topology) -> tuple[tuple[str, str], ...]:
     cuts = topology.joints[topology.num_bodies :]
     rotation = lambda rows: [(cuts[cut], ROTATIONS[i, j]) for cut, i, j in rows]
     translation = lambda rows: [(cuts[cut], TRANSLATIONS[i]) for cut, i in rows]
+    slips = topology.slips[topology.num_rows - topology.num_constraint_rows :]
+    holds = lambda row: (topology.constraints[topology.constraint_of_row[row]], "slip" if slips[row] else "coordinates")
     return (
         *rotation(topology.rotation_rows),
         *translation(topology.translation_rows),
         *((cuts[cut], "combined") for cut in topology.combining),
-        *((topology.constraints[constraint], "coordinates") for constraint in topology.constraint_of_row),
+        *map(holds, range(topology.num_constraint_rows)),
         *rotation(topology.immobile_rotation_rows),
         *translation(topology.immobile_translation_rows),
     )

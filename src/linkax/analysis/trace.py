@@ -237,9 +237,14 @@ def trace(
 def start_of(mechanism: Mechanism, start: State) -> State:
     """Check the state where a way begins.
 
-    **Raises:** `ValueError` for one that is none, or that is in single precision, with loops too far open.
+    **Raises:** `ValueError` for one that is none, or that is in single precision, with loops too far open, and for a
+    mechanism whose places depend on the way that it takes to them.
     """
     start = checked_state(mechanism, start)
+    slipping = [constraint.display_name for constraint in mechanism.constraints if constraint.slip_units]
+    if slipping:
+        names = " and ".join(slipping)
+        raise ValueError(f"{names} holds speeds, and no places that could be traced; integrate by linkax.simulate")
     if start.q.dtype != np.float64:
         raise ValueError(f"start is in {start.q.dtype}; make it with linkax.assemble, in double precision")
     return start

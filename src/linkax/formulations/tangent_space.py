@@ -258,6 +258,8 @@ class TangentSpace(AbstractFormulation):
         if errors:
             linear = lax.stop_gradient(linear_system(system, t, q))
             in_q, in_v = jax.vmap(lambda error: self.tangential_part(linear, split, error))(jnp.stack(errors))
+            if np.any(system.topology.slips):  # along which no correction of places takes errors out
+                in_q = errors[0]
             open_ = largest(residual(linear.configuration)) * system.scales
             errors = jnp.where(jnp.abs(in_q) < open_, open_, in_q), in_v
         return q, v, errors, split.distance

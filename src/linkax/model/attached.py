@@ -11,6 +11,7 @@ from jaxtyping import Float
 from linkax.model.bodies import GROUND_NAME, BodyOrFrame, Frame, frame_of
 from linkax.model.numbers import value
 from linkax.model.terms import Term
+from linkax.spatial.vectors import cross
 from linkax.xla.arrays import Array
 
 
@@ -92,6 +93,42 @@ class Attached(AbstractPoses):
     def coordinate(self, term: Term) -> Float[Array, ""]:
         """Coordinate of one speed of a joint [rad or m]."""
         return self.coordinates[term.joint][(term.index or 0) + (term.joint in self.quaternions)]
+
+
+class Twist(NamedTuple):
+    """The motion of a body in ground axes: angular velocity [rad/s], and velocity of its reference point [m/s]."""
+
+    angular: Float[Array, "3"]
+    linear: Float[Array, "3"]
+
+
+class Moving(Attached):
+    """What the speeds of a constraint are read from: twists of the bodies, and speeds of joints, besides their places.
+
+    `point_velocity` and `angular_velocity` read it at a body or `body.at(...)`, in ground axes, `joint_speed` by a
+    joint's name.
+    """
+
+    twists: Mapping[str, Twist]
+    speeds: Mapping[str, Float[Array, " n"]]
+
+    def angular_velocity(self, body: BodyOrFrame) -> Float[Array, "3"]:
+        """Angular velocity of a body in ground axes [rad/s]."""
+        return self.twists[frame_of(body, "body").body].angular
+
+    def point_velocity(self, point: BodyOrFrame) -> Float[Array, "3"]:
+        """Velocity of a point of a body in ground axes [m/s]."""
+        frame = frame_of(point, "point")
+        rotation, twist = self.pose(frame.body).rotation, self.twists[frame.body]
+        return twist.linear + cross(twist.angular, rotation @ jnp.asarray(frame.offset, rotation.dtype))
+
+    def velocity_at(self, body: BodyOrFrame, place: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Velocity of what is at a place on a body, given from the frame's origin in ground axes [m/s]."""
+        return self.point_velocity(body) + cross(self.angular_velocity(body), place)
+
+    def joint_speed(self, name: str) -> Float[Array, ""] | Float[Array, " n"]:
+        """Speed of a joint [rad/s or m/s]; (n,) where it has several."""
+        return alone(self.speeds[name])
 
 
 def alone(values: Any) -> Any:

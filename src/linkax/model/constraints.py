@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from linkax.model.attached import Attached, BodyPose
+from linkax.model.attached import Attached, BodyPose, Moving, Twist
 from linkax.model.bodies import Frame
 from linkax.model.elements import ENDED, AbstractElement, Time
 from linkax.model.functions import Law, raised
@@ -34,21 +34,38 @@ class AbstractConstraint(AbstractElement):
     `Solution.reaction` of its name is its multiplier μ, or an array of them, (n_t, k): a force [N] for a row in metres,
     a moment [N m] for one in radians. They act as the generalised force Jᵀμ, along growing g.
 
+    A constraint on speeds that no constraint on places is behind, as of a skate or a wheel that rolls, is a `slip`:
+    speeds that vanish. `units` are () then, unless there is a residual too, and its multipliers come last.
+
     - `units`: of the rows, one for each number of the residual: "m", "rad", "m²", or "" for a plain number.
+    - `slip_units`: likewise of the slip, "m" for m/s.
     - `is_driven`: whether the residual depends on time.
     """
 
     units: ClassVar[tuple[str, ...]] = ("m",)
+    slip_units: ClassVar[tuple[str, ...]] = ()
     is_driven: ClassVar[bool] = False
 
     name: str = eqx.field(static=True)
 
-    @abc.abstractmethod
     def residual(self, t: Time, attached: Attached) -> Scalar | Float[Array, " k"]:
         """Compute g at time t [s]: one number, or (k,), twice differentiable by JAX.
 
         **Arguments:** `attached`: where its bodies and joints are; see `linkax.Attached`.
         """
+        raise ValueError(f"{self.display_name} defines no residual; define one, or say `units = ()` where it has none")
+
+    def slip(self, t: Time, moving: Moving) -> Scalar | Float[Array, " k"]:
+        """Compute speeds that vanish: one number, or (k,), linear in velocities, differentiable by JAX.
+
+        **Arguments:** `moving`: how its bodies and joints move; see `linkax.Moving`.
+        """
+        raise ValueError(f"{self.display_name} defines no slip; define one, or leave slip_units out")
+
+    @property
+    def num_rows(self) -> int:
+        """Number of its rows, those of slip included."""
+        return len(self.units) + len(self.slip_units)
 
     @property
     def display_name(self) -> str:
@@ -74,44 +91,55 @@ class AbstractConstraint(AbstractElement):
 
         **Arguments:** `length`: of the mechanism [m]; `slides`: whether the coordinate of a term is in metres.
         """
-        return [length ** POWERS_OF_LENGTH[unit] for unit in self.units]
+        return [length ** POWERS_OF_LENGTH[unit] for unit in (*self.units, *self.slip_units)]
 
     def checked_residual(self, t: Time, attached: Attached) -> Float[Array, " k"]:
         """Compute the residual and check it.
 
         **Raises:** `ValueError` for a residual that raises, or has another shape than `units`.
         """
+        return self._checked("residual", self.residual, self.units, t, attached)
+
+    def checked_slip(self, t: Time, moving: Moving) -> Float[Array, " k"]:
+        """Compute the slip and check it likewise."""
+        return self._checked("slip", self.slip, self.slip_units, t, moving)
+
+    def _checked(self, what, function, units, *arguments):
+        if not units:
+            return jnp.zeros(0)
         try:
-            found = jnp.asarray(self.residual(t, attached))
+            found = jnp.asarray(function(*arguments))
         except ENDED as error:
             if isinstance(error, ValueError) and str(error).startswith(self.display_name):
                 raise
-            told = raised(error, self.residual, (t, attached))
-            raise ValueError(f"{self.display_name}: its residual raises {told}") from error
-        count = len(self.units)
+            raise ValueError(f"{self.display_name}: its {what} raises {raised(error, function, arguments)}") from error
+        count = len(units)
         if found.shape not in ((count,), () if count == 1 else (count,)):
             raise ValueError(
-                f"{self.display_name}: its residual has shape {found.shape}, and units {self.units} are {count}; give "
-                "one unit for each of its numbers"
+                f"{self.display_name}: its {what} has shape {found.shape}, and units {units} are {count}; give one "
+                "unit for each of its numbers"
             )
         return found.reshape(count)
 
     def check_residual(self, coordinates: Mapping[str, int]) -> None:
-        """Evaluate the residual for its shape, and for whether it depends on time.
+        """Evaluate residual and slip for their shapes, and for whether they depend on time.
 
         **Arguments:** `coordinates`: how many each of its joints has.
 
         **Raises:** `ValueError` as `checked_residual` does, and for a residual that reads t without `is_driven`.
         """
         turned = BodyPose(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))
-        poses = ByName({frame.body: turned for frame in self.frames}, f"body of {self.display_name}")
-        joints = {name: jnp.zeros(coordinates[name]) for name in self.joints}
-        attached = Attached(poses, ByName(joints, f"joint of {self.display_name}"), ())
-        traced = jax.make_jaxpr(lambda t: self.checked_residual(t, attached))(0.0).jaxpr
+        names = dict.fromkeys(frame.body for frame in self.frames)
+        of_body, of_joint = f"body of {self.display_name}", f"joint of {self.display_name}"
+        joints = ByName({name: jnp.zeros(coordinates[name]) for name in self.joints}, of_joint)
+        twists = ByName({name: Twist(jnp.zeros(3), jnp.zeros(3)) for name in names}, of_body)
+        moving = Moving(ByName({name: turned for name in names}, of_body), joints, (), twists, joints)
+        rows = lambda t: (self.checked_residual(t, moving), self.checked_slip(t, moving))
+        traced = jax.make_jaxpr(rows)(0.0).jaxpr
         (time,) = traced.invars
         reads = any(time is variable for step in traced.eqns for variable in step.invars)
         if reads and not self.is_driven:
-            raise ValueError(f"{self.display_name}: its residual reads t; say `is_driven = True` in its class")
+            raise ValueError(f"{self.display_name}: its residual or slip reads t; say `is_driven = True` in its class")
 
     def held(self, t: Number, unless: Any = False) -> "AbstractConstraint":
         """Keep the residual of time t at all times, except where `unless`, which may be traced."""
@@ -133,6 +161,10 @@ class HeldConstraint(AbstractConstraint):
         return self.constraint.units
 
     @property
+    def slip_units(self) -> tuple[str, ...]:
+        return self.constraint.slip_units
+
+    @property
     def is_driven(self) -> bool:
         return self.unless is not False
 
@@ -149,7 +181,13 @@ class HeldConstraint(AbstractConstraint):
         return self.constraint.joints
 
     def residual(self, t: Number, attached: Attached) -> Scalar | Float[Array, " k"]:
-        return self.constraint.residual(self.t + jnp.where(self.unless, t - self.t, 0.0), attached)
+        return self.constraint.residual(self._at(t), attached)
+
+    def slip(self, t: Number, moving: Moving) -> Scalar | Float[Array, " k"]:
+        return self.constraint.slip(self._at(t), moving)
+
+    def _at(self, t):
+        return self.t + jnp.where(self.unless, t - self.t, 0.0)
 
 
 class LinearConstraint(AbstractConstraint):

@@ -200,7 +200,8 @@ def _topology(tree: SpanningTree, constraints: list[AbstractConstraint], all_row
         driven_by=tuple(joint.driven_by for joint in joints),
         **split_rows(tree, all_rows),
         constraints=tuple(constraint.name for constraint in constraints),
-        constraint_rows=tuple(len(constraint.units) for constraint in constraints),
+        constraint_rows=tuple(constraint.num_rows for constraint in constraints),
+        constraint_slips=tuple(len(constraint.slip_units) for constraint in constraints),
         constraint_terms=tuple(constraint.terms for constraint in constraints),
         constraint_bodies=tuple(tuple(index[f.body] for f in constraint.frames) for constraint in constraints),
     )

@@ -44,7 +44,8 @@ class Topology:
     - `rotation_rows`: (cut joint, i, j) of each loop row h₁ⁱ·h₂ʲ; cut joints and axes counted from 0.
     - `translation_rows`: (cut joint, i) of each loop row h₁ⁱ·s.
     - `immobile_rotation_rows`, `immobile_translation_rows`: rows that no motion changes, which are left out of these.
-    - `constraints`: names of the constraints besides cut joints, and `constraint_rows`, how many rows each has.
+    - `constraints`: names of the constraints besides cut joints, `constraint_rows`, how many rows each has, and
+      `constraint_slips`, how many of these, the last, are of speeds alone.
     - `constraint_terms`: the terms that each constraint reads.
     - `constraint_bodies`: the bodies that each constraint attaches to.
 
@@ -65,6 +66,7 @@ class Topology:
     immobile_translation_rows: tuple[tuple[int, int], ...]
     constraints: tuple[str, ...] = ()
     constraint_rows: tuple[int, ...] = ()
+    constraint_slips: tuple[int, ...] = ()
     constraint_terms: tuple[tuple[Term, ...], ...] = ()
     constraint_bodies: tuple[tuple[int, ...], ...] = ()
 
@@ -113,6 +115,13 @@ class Topology:
     def num_constraint_rows(self) -> int:
         """Number of rows of `constraints`, which come last."""
         return sum(self.constraint_rows)
+
+    @cached_property
+    def slips(self) -> np.ndarray:
+        """Which rows are of speeds alone, without a residual, (m,)."""
+        counts = zip(self.constraint_rows, self.constraint_slips, strict=True)
+        of_constraints = [slips for rows, count in counts for slips in (rows - count) * [False] + count * [True]]
+        return np.array((self.num_rows - len(of_constraints)) * [False] + of_constraints, dtype=bool)
 
     @cached_property
     def constraint_of_row(self) -> np.ndarray:

@@ -51,7 +51,10 @@ class LoopClosure(eqx.Module):
         moved = lambda change: configure(self.system, self.t, retract(topology, q, change))
         held = self.held.slopes(lambda change: self.held.apart(moved(change)), topology, q.dtype)
         close_loops = as_if_closed(configuration)
-        return self.rows(configuration), jnp.concatenate([jacobian(close_loops), flips(close_loops)[1], held])
+        slopes = jacobian(close_loops)
+        if np.any(topology.slips):  # which hold no places
+            slopes = jnp.where(topology.slips[:, None], 0.0, slopes)
+        return self.rows(configuration), jnp.concatenate([slopes, flips(close_loops)[1], held])
 
     @straight_line
     def rows_at(self, q: Float[Array, " n_q"]) -> Float[Array, " n"]:

@@ -1,0 +1,142 @@
+"""Constraints on speeds, against closed forms: Chaplygin's sleigh, rolling discs, a ball on a turntable."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+
+GRAVITY = lx.Gravity([0.0, 0.0, -9.81])
+TS = np.linspace(0.0, 2.0, 21)
+SAVES = diffrax.SaveAt(ts=jnp.asarray(TS))
+
+
+def run(mechanism, state, accuracy=lx.PRECISE):
+    return lx.simulate(mechanism, state, t1=2.0, accuracy=accuracy, saveat=SAVES)
+
+
+def sleigh(apart):
+    """A plate on an edge, its centre of mass `apart` ahead of it; it turns at 2 rad/s and goes at 0.5 m/s."""
+    plate = lx.RigidBody("plate", 2.0, jnp.array([1.0, 0.0, 0.0]) * apart, 0.3)
+    ice = lx.Planar("ice", lx.GROUND, plate, "z")
+    mechanism = lx.Mechanism([plate], [ice], constraints=[lx.Skate("edge", plate, lx.GROUND)])
+    state = lx.assemble(mechanism, {"ice": [0.0, 0.0, 0.0]}, {("ice", 0): 2.0, ("ice", 1): 0.5})
+    return mechanism, state
+
+
+def test_chaplygins_sleigh():
+    """A skate takes one degree of freedom from speeds alone; u along the edge goes as tanh, ω as sech."""
+    apart, mass, inertia = 0.2, 2.0, 0.3
+    mechanism, state = sleigh(jnp.array(apart))
+    found = lx.mobility(mechanism, state)
+    assert (found.degrees_of_freedom, found.rows) == (2, (("edge", "slip"),))
+    solution = run(mechanism, state)
+    about_edge = inertia + mass * apart**2
+    # u̇ = a ω² and ω̇ = −(m a / I) u ω keep m u² + I ω²; so u = U tanh(k t + b), ω = U √(m / I) sech(k t + b).
+    fastest = np.sqrt(0.25 + about_edge / mass * 4.0)
+    begin, pace = np.arctanh(0.5 / fastest), mass * apart / about_edge * fastest
+    u, omega = fastest * np.tanh(begin + pace * TS), fastest * np.sqrt(mass / about_edge) / np.cosh(begin + pace * TS)
+    turn = np.asarray(solution.joint("ice"))[:, 0]
+    velocity = np.asarray(solution.velocity("plate", [0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(solution.joint_speed("ice")[:, 0], omega, atol=1e-9)
+    np.testing.assert_allclose(velocity[:, 0] * np.cos(turn) + velocity[:, 1] * np.sin(turn), u, atol=1e-9)
+    np.testing.assert_allclose(velocity[:, 1] * np.cos(turn) - velocity[:, 0] * np.sin(turn), 0.0, atol=1e-12)
+    np.testing.assert_allclose(solution.energy(), solution.energy()[0], rtol=1e-10)
+    # Across: m (u ω + a ω̇) of the centre of mass.
+    across = mass * (u * omega - apart * mass * apart / about_edge * u * omega)
+    np.testing.assert_allclose(solution.reaction("edge"), across, atol=1e-8)
+
+
+def tilted(tilt):
+    """Axes of a disc, z its axis, at a tilt of its plane from the vertical, heading along y, leaning to x."""
+    c, s = np.cos(tilt), np.sin(tilt)
+    return np.array([[s, 0.0, -c], [0.0, 1.0, 0.0], [c, 0.0, s]])
+
+
+def disc_rolling(tilt, turning, spin, radius=0.4, mass=1.5):
+    """A disc that rolls with precession `turning` about the vertical, and a rate `spin` about its axis."""
+    axial, across = mass * radius**2 / 2.0, mass * radius**2 / 4.0
+    disc = lx.RigidBody("disc", mass, inertia=[across, across, axial])
+    rolling = lx.RollingDisc("rolling", disc, lx.GROUND, radius)
+    mechanism = lx.Mechanism([disc], [lx.Free("flight", lx.GROUND, disc)], [GRAVITY], [rolling])
+    axes = tilted(tilt)
+    omega = turning * np.array([0.0, 0.0, 1.0]) + spin * axes[:, 2]
+    contact = -radius * axes[:, 0]
+    velocity = -np.cross(omega, contact)
+    place = lx.Pose(-contact, axes)
+    speeds = {"disc": lx.Velocity(velocity, omega)}
+    return mechanism, lx.assemble(mechanism, {"disc": place}, speeds)
+
+
+def steady_spin(tilt, turning, radius=0.4):
+    """The rate about the axis at which a uniform thin disc keeps its tilt α, at a precession Ω (Routh, art. 244).
+
+    Moments about the contact: (C + m r²) n Ω cos α = A Ω² sin α cos α − m g r sin α, n the rate about the axis in all.
+    """
+    sine, cosine = np.sin(tilt), np.cos(tilt)
+    needed = radius**2 / 4.0 * turning**2 * sine * cosine - 9.81 * radius * sine
+    return needed / (1.5 * radius**2 * turning * cosine) - turning * sine
+
+
+def test_a_disc_rolls_steadily():
+    """The tilt stays, and the centre goes around in a circle."""
+    tilt, turning = 0.35, 1.8
+    mechanism, state = disc_rolling(tilt, turning, steady_spin(tilt, turning))
+    assert lx.mobility(mechanism, state).degrees_of_freedom == 3
+    solution = run(mechanism, state)
+    np.testing.assert_allclose(solution.position("disc")[:, 2], 0.4 * np.cos(tilt), atol=1e-8)
+    upwards = solution.angular_velocity("disc")[:, 2]
+    np.testing.assert_allclose(upwards, upwards[0], atol=1e-8)
+    np.testing.assert_allclose(solution.energy(), solution.energy()[0], rtol=1e-9)
+    np.testing.assert_allclose(solution.reaction("rolling")[:, 0], 1.5 * 9.81, atol=1e-7)
+    assert solution.worst_violation().position < 1e-12
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_disc_rolls_upright_from_a_speed_on(share):
+    """Upright it is stable where ω² > A m g r / (C (C + m r²)), of a uniform thin disc g / (3 r)."""
+    spin = share * np.sqrt(9.81 / (3.0 * 0.4))
+    mechanism, state = disc_rolling(1e-5, 0.0, spin)
+    found = lx.simulate(mechanism, state, t1=6.0)
+    lean = np.abs(np.asarray(found.orientation("disc"))[:, 2, 2])
+    assert (np.max(lean) > 1e-3) == (share < 1.0)
+
+
+def turntable(speed):
+    """A ball on a table that turns: its path is a circle, run through at 2/7 of the table's rate."""
+    table, ball = lx.RigidBody("table", 5.0, inertia=1.0), lx.RigidBody("ball", 0.5, inertia=3 * [0.4 * 0.5 * 0.01])
+    joints = [lx.Revolute("pivot", lx.GROUND, table, "z"), lx.Free("flight", lx.GROUND, ball)]
+    rolling = lx.RollingSphere("rolling", ball, table, 0.1)
+    mechanism = lx.Mechanism([table, ball], joints, [GRAVITY], [rolling, lx.Drive("motor", "pivot", speed=speed)])
+    speeds = {"ball": lx.Velocity([0.3, 0.1, 0.0]), ("flight", 2): 0.0}
+    return mechanism, lx.assemble(mechanism, {"ball": lx.Pose([1.0, 0.0, 0.1], np.eye(3))}, speeds)
+
+
+def test_a_ball_on_a_turntable():
+    mechanism, state = turntable(jnp.array(4.0))
+    found = run(mechanism, state)
+    rate = 2.0 / 7.0 * 4.0
+    begin, velocity = np.array([1.0, 0.0]), np.array([0.3, 0.1])
+    centre = begin - np.array([velocity[1], -velocity[0]]) / rate  # v = rate z × (r − centre)
+    arm, c, s = begin - centre, np.cos(rate * TS), np.sin(rate * TS)
+    path = centre + np.stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]], axis=-1)
+    np.testing.assert_allclose(found.position("ball")[:, :2], path, atol=1e-8)
+
+
+def glided(apart):
+    mechanism, state = sleigh(apart)
+    return run(mechanism, state).q[-1, 1]
+
+
+def test_derivatives():
+    at, step = 0.2, 1e-5
+    central = (glided(jnp.array(at + step)) - glided(jnp.array(at - step))) / (2.0 * step)
+    np.testing.assert_allclose([jax.grad(glided)(at), jax.jacfwd(glided)(at)], central, rtol=1e-6)
+
+
+def test_what_holds_speeds_alone_is_not_traced():
+    mechanism, state = sleigh(jnp.array(0.2))
+    with pytest.raises(ValueError, match="skate 'edge' holds speeds, and no places"):
+        lx.trace(mechanism, state, along={("ice", 0): np.linspace(0.0, 1.0, 3)})
