@@ -66,6 +66,7 @@ from linkax.model.gears import Gear as Gear  # noqa: E402
 from linkax.model.gears import Rack as Rack  # noqa: E402
 from linkax.model.guides import PointOnSurface as PointOnSurface  # noqa: E402
 from linkax.model.guides import Prescribed as Prescribed  # noqa: E402
+from linkax.model.internal_states import InternalState as InternalState  # noqa: E402
 from linkax.model.joint_forces import JointDamper as JointDamper  # noqa: E402
 from linkax.model.joint_forces import JointFriction as JointFriction  # noqa: E402
 from linkax.model.joint_forces import JointSpring as JointSpring  # noqa: E402

@@ -23,6 +23,8 @@ ARGS = SimpleNamespace(
     accuracy=lx.Accuracy(rtol=1e-8),
     method=lx.TangentSpace().prepared(float),
     unpacked=lambda y: (y[:2], y[2:4]),
+    internal=lambda y: None,
+    scales=(SCALES, SCALES),
     can_start=True,
 )
 Y = jnp.array([1.0, 2e3, 3.0, 4e3, 0.0])

@@ -19,6 +19,7 @@ from linkax.analysis.steady import (
     widest_gap,
 )
 from linkax.equations.coordinates import retract
+from linkax.model.internal_states import refuse_states
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.state import State
@@ -85,13 +86,14 @@ def equilibrium(mechanism: Mechanism, state: State, *, t: ArrayLike = 0.0) -> St
 
     **Returns:** the `State` in equilibrium.
 
-    **Raises:** `EquilibriumError` where the search does not converge, cannot close the loops or leave an unstable
-    equilibrium, or where driven joints do not move steadily. Inside JAX transformations nothing is raised, and
-    coordinates are NaN.
+    **Raises:** `ValueError` for a force element with internal states; `EquilibriumError` where the search does not
+    converge, cannot close the loops or leave an unstable equilibrium, or where driven joints do not move steadily.
+    Inside JAX transformations nothing is raised, and coordinates are NaN.
 
     **Warns:** `StabilityWarning`.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
+    refuse_states(mechanism.forces, "linkax.equilibrium")
     moves = may_move(state) and any(constraint.is_driven for constraint in mechanism.constraints)
     reached, ending = _equilibrium(mechanism, state, t, moves)
     if not moves:

@@ -11,6 +11,7 @@ from jaxtyping import ArrayLike, Float
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import rates
 from linkax.equations.dynamics import generalised_force, mass_matrix
+from linkax.equations.internal_states import bound
 from linkax.equations.loops import gamma, jacobian
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
@@ -104,7 +105,7 @@ def inverse_dynamics(
 
 @Program
 def _inverse_dynamics(mechanism, state, wanted, t):
-    system, (q, v) = system_of(mechanism, state.q.dtype), (state.q, state.v)
+    system, (q, v) = bound(system_of(mechanism, state.q.dtype), state.internal), (state.q, state.v)
     configuration = configure(system, t, q)
     motion, mass, loops = move(configuration, v), mass_matrix(configuration), jacobian(configuration)
     speeds = lambda q: wanted.speeds(move(configure(system, t, q), v)).flat()

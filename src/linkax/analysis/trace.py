@@ -90,6 +90,7 @@ class Trace(Kinematics):
     along: str = eqx.field(static=True)
     by_joint: bool = eqx.field(static=True)
     rank_nearby: Int[Array, "*batch k"] | None = None
+    internal: None = None  # of which positions say nothing
 
     @property
     def known_dynamics(self) -> Dynamics:
@@ -227,7 +228,7 @@ def trace(
     if along is None and (ways := concrete(freedom)) is not None and ways > 1:
         raise ValueError(f"the mechanism can move in {ways} ways, and arc_length follows one; give along=, or drives")
     run = Run.of_state(mechanism, start, t, DEFAULT_FORMULATION, BALANCED)
-    named = dict(zip(Trace.by_time, rows, strict=True))
+    named: Any = dict(zip(Trace.by_time, rows, strict=True))
     found = Trace(run=run, **named, result=result, along=what, by_joint=course.asked.values.shape[1] == 1)
     if throw and all_concrete(found) and not np.all(np.isfinite(found.ts)):
         raise TraceError(_stopped(found, course), found)

@@ -30,6 +30,7 @@ from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
+from linkax.model.internal_states import refuse_states
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import whole_number
 from linkax.simulation.explain.diagnosis import massless_bodies
@@ -141,10 +142,12 @@ def linearise(
 
     **Returns:** a `Linearisation`.
 
-    **Raises:** `ValueError` for a state that is neither in equilibrium nor in steady motion. Inside JAX transformations
+    **Raises:** `ValueError` for a state that is neither in equilibrium nor in steady motion, and for a force element
+    with internal states. Inside JAX transformations
     nothing is raised, and the numbers are NaN.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
+    refuse_states(mechanism.forces, "linkax.linearise")
     if degrees_of_freedom is None:
         rank = concrete(_rank(mechanism, state, t))
         if rank is None:

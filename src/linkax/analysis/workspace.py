@@ -62,6 +62,7 @@ class Workspace(Kinematics):
     axes: tuple[tuple[str, Float[np.ndarray, " _"]], ...]
     reached: Bool[np.ndarray, "..."]
     rank_nearby: Int[Array, "*batch k"] | None = None
+    internal: None = None  # of which positions say nothing
 
     def grid(self, reading: ArrayLike) -> np.ndarray:
         """What was read for all positions, (N, ...), with the axes of the grid in place of the first."""

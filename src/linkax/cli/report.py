@@ -89,10 +89,12 @@ def states(solution: Solution) -> dict[str, np.ndarray]:
     """The arrays of a trajectory that need no further compilation.
 
     - `t`: times, (n_t,) [s]. `q`, `v`: coordinates and speeds of the tree's joints, (n_t, n_q) and (n_t, n_v).
+    - `internal`: internal states of force elements, (n_t, n_s), where there are some.
     - `coordinates`, `speeds`: the joint of each column of `q` and `v`.
     """
     topology = solution.mechanism.topology
     owners = lambda slices: [name for name, columns in slices.items() for _ in range(columns.stop - columns.start)]
     kept = {"t": solution.ts, "q": solution.q, "v": solution.v}
+    kept |= {} if solution.internal is None else {"internal": solution.internal}
     kept |= {"coordinates": owners(topology.coordinates), "speeds": owners(topology.speeds)}
     return {name: np.asarray(values) for name, values in kept.items()}

@@ -1,7 +1,7 @@
 """Force elements, and gravity. Others are in `joint_forces`, `point_forces` and `ropes`."""
 
 import abc
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from linkax.model.bodies import Frame
 from linkax.model.elements import ENDED, AbstractElement, Configuration, Motion, System, Time
 from linkax.model.functions import raised
+from linkax.model.internal_states import InternalState, States, by_name, joined_rates, shapes_of
 from linkax.model.numbers import Vector, number
 from linkax.xla.arrays import Array, Scalar
 
@@ -49,9 +50,27 @@ class AbstractForce(AbstractElement):
     `linkax.Motion`: it tells where all bodies are and how they move at one instant, and makes loads on points and
     along joints. `motion.system` has the mechanism's numbers in the order of its bodies.
 
-    A load with a kink or a jump needs a `switch`, which is zero there, and takes the side as a third argument:
+    A load with a kink or a jump needs a `switch`, which is zero there, and takes the side as a last argument:
     `load(t, motion, on)`. Steps then end at the switch, and derivatives are right across it.
+
+    An element with internal states, such as a current, names them in `states`, and has `rates`. All functions of
+    (t, motion) then take the values of the states next, {name: value}: `load(t, motion, states)`, and
+    `potential_energy(configuration, states)`. They are integrated with the motion, see `Solution.states`.
     """
+
+    @property
+    def states(self) -> Mapping[str, InternalState]:
+        """Internal states by name, each a `linkax.InternalState`; none by default."""
+        return {}
+
+    def rates(self, t: Time, motion: Motion, states: States, *args: Any) -> States:
+        """Compute the rates of the internal states, {name: rate}, in their units per second."""
+        raise ValueError(f"{self.display_name} has internal states, and no rates; define rates(t, motion, states)")
+
+    @property
+    def itself(self) -> "AbstractForce":
+        """The element, also of one that is bound to its states."""
+        return self
 
     @property
     def needs_coordinate(self) -> bool:
@@ -82,11 +101,11 @@ class AbstractForce(AbstractElement):
     def load(self, t: Time, motion: Motion, *args: Any, **kwargs: Any) -> Load:
         """Compute the load at time t [s].
 
-        With a `switch` it takes a third argument `on`: whether the switch is positive. A step that adapts keeps `on`
+        With a `switch` it takes a last argument `on`: whether the switch is positive. A step that adapts keeps `on`
         from where it begins, so that the load goes on smoothly a little past zero.
         """
 
-    def switch(self, t: Time, motion: Motion) -> Scalar | None:
+    def switch(self, t: Time, motion: Motion, *args: Any) -> Scalar | None:
         """Compute a number that changes sign where the load has a kink or jumps; None for a smooth load.
 
         Its magnitude should be about one, like that of a strain. The motion must go through zero there, and not be
@@ -116,9 +135,12 @@ class AbstractForce(AbstractElement):
     def applied(self, t: Time, motion: Motion, on: Any = None) -> Load:
         """Compute the load and check it; `on`: see `load`, by default whether the switch is positive now.
 
-        **Raises:** `ValueError` for a load that raises, is no `Load`, or has parts of another shape or type.
+        **Raises:** `ValueError` for a load that raises, is no `Load`, or has parts of another shape or type; for an
+        element with internal states, whose values are not known.
         """
-        side = self.side(t, motion) if on is None or not has_switch(self) else (on,)
+        if self.states:
+            raise ValueError(f"{self.display_name} has internal states, which only runs and their solutions know")
+        side = self._held_side(t, motion, on)
         try:
             found = self.load(t, motion, *side)
         except ENDED as error:
@@ -135,20 +157,78 @@ class AbstractForce(AbstractElement):
                 )
         return found
 
+    def state_rates(self, t: Time, motion: Motion, on: Any = None) -> Float[jax.Array, " n"]:
+        """Compute the rates of all internal states and check them; none for an element without."""
+        return jnp.zeros(0, motion.system.dtype)
+
+    def _held_side(self, t, motion, on):
+        return self.side(t, motion) if on is None or not has_switch(self) else (on,)
+
     def _ended(self, what, error, function, arguments):
-        """What to raise where the load or the switch has raised an error."""
+        """What to raise where the load, the switch or the rates have raised an error."""
         if isinstance(error, ValueError) and str(error).startswith(self.display_name):
             return error
         return ValueError(f"{self.display_name}: its {what} raises {raised(error, function, arguments)}")
 
-    def potential_energy(self, configuration: Configuration) -> Scalar:
+    def potential_energy(self, configuration: Configuration, *args: Any) -> Scalar:
         """Compute the potential energy [J]; zero for an element without one."""
         return jnp.zeros((), configuration.system.dtype)
 
 
+class Bound(AbstractForce):
+    """A force element at values of its internal states, (n,): to the equations of motion, one without any."""
+
+    element: AbstractForce
+    values: Float[Array, " n"]
+
+    @property
+    def itself(self) -> AbstractForce:
+        return self.element
+
+    @property
+    def named(self) -> States:
+        """The values by the names of the states."""
+        return by_name(shapes_of(self.element.states), self.values)
+
+    @property
+    def display_name(self) -> str:
+        return self.element.display_name
+
+    @property
+    def conserves_energy(self) -> bool:
+        return self.element.conserves_energy
+
+    def extent(self, configuration: Configuration) -> Any:
+        return self.element.extent(configuration)
+
+    def strength(self, t: Time, motion: Motion, *args: Any) -> Any:
+        return self.element.strength(t, motion, self.named, *args)
+
+    def load(self, t: Time, motion: Motion, *args: Any) -> Load:
+        return self.element.load(t, motion, self.named, *args)
+
+    def switch(self, t: Time, motion: Motion) -> Scalar | None:
+        return self.element.switch(t, motion, self.named)
+
+    def potential_energy(self, configuration: Configuration) -> Scalar:
+        return self.element.potential_energy(configuration, self.named)
+
+    def state_rates(self, t: Time, motion: Motion, on: Any = None) -> Float[jax.Array, " n"]:
+        arguments = t, motion, *self._held_side(t, motion, on)
+        try:
+            found = self.element.rates(t, motion, self.named, *arguments[2:])
+        except ENDED as error:
+            raise self._ended("rates", error, self.element.rates, arguments) from error
+        return joined_rates(self.element.states, found, self.display_name, motion.system.dtype)
+
+    def _ended(self, what, error, function, arguments):
+        t, motion, *side = arguments
+        return super()._ended(what, error, getattr(self.element, what), (t, motion, self.named, *side))
+
+
 def has_switch(force: AbstractForce) -> bool:
     """Tell whether the load of a force element has a kink or jumps, see `AbstractForce.switch`."""
-    return type(force).switch is not AbstractForce.switch
+    return type(force.itself).switch is not AbstractForce.switch
 
 
 def given_name(force: AbstractForce) -> str | None:

@@ -87,7 +87,8 @@ def _remedy(error, function, arguments):
     if isinstance(error, ValueError):  # which says it
         return ""
     if isinstance(error, TypeError) and not _takes(function, arguments):
-        return f"; it must take {('t', '(t, motion)', '(t, motion, on)')[len(arguments) - 1]}"
+        names = ("t", "motion", *("states" if isinstance(more, dict) else "on" for more in arguments[2:]))
+        return "; it must take t" if len(arguments) == 1 else f"; it must take ({', '.join(names)})"
     known = get_close_matches(getattr(error, "name", None) or "", dir(getattr(error, "obj", None)), 3)
     return f"; known: {', '.join(map(repr, known))}" if known else "; check it"
 

@@ -14,6 +14,7 @@ from linkax.model.description import described
 from linkax.model.discretisation import Parts, discretise_beams, is_split, split_cuts, tree_joints_first
 from linkax.model.forces import AbstractForce, given_name
 from linkax.model.immobile_rows import split_rows
+from linkax.model.internal_states import checked_states
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
@@ -164,6 +165,8 @@ def _check_names(parts: Parts) -> dict[str, RigidBody]:
     forces = [force for force in parts.forces if given_name(force)]
     _by_name([*parts.joints, *parts.constraints, *forces], "joint, constraint or force")
     _check_references(bodies, joints, parts.constraints, parts.forces)
+    for force in parts.forces:
+        checked_states(force.states, force.display_name)
     return bodies
 
 

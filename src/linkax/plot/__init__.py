@@ -8,5 +8,6 @@ from linkax.plot.histories import joint as joint
 from linkax.plot.histories import motion as motion
 from linkax.plot.histories import reaction as reaction
 from linkax.plot.histories import singularity as singularity
+from linkax.plot.histories import states as states
 from linkax.plot.histories import violations as violations
 from linkax.plot.paths import path as path

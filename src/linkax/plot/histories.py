@@ -159,6 +159,28 @@ def energy(solution: Solution) -> Figure:
     return figure
 
 
+def states(solution: Solution, element: str) -> Figure:
+    """Plot the internal states of a force element against time [s], those of one unit together.
+
+    **Arguments:** `element`: its name, one of `mechanism.force_names`.
+    """
+    solution = reached(solution)
+    histories = solution.states(element)
+    found = solution.mechanism.forces[solution.mechanism.force_names.index(element)]
+    units = dict.fromkeys(state.unit for state in found.states.values())
+    figure, panels = _panels(f"Internal states of {element}", len(units))
+    for panel, unit in zip(panels, units, strict=True):
+        for name, values in histories.items():
+            if found.states[name].unit == unit:
+                columns = np.asarray(values).reshape(len(solution.ts), -1)
+                several = columns.shape[1] > 1
+                labels = [f"{name} {index}" if several else name for index in range(columns.shape[1])]
+                panel.plot(solution.ts, columns, label=labels)
+        panel.set_ylabel(f"[{unit or '1'}]")
+        panel.legend(frameon=False, fontsize="small")
+    return figure
+
+
 def _panels(title, count):
     figure = Figure(figsize=(7.0, 1.2 + 1.9 * count if count > 1 else 3.8), layout="constrained")
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]

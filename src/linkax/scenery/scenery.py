@@ -126,14 +126,15 @@ def reached(solution: Moving) -> Moving:
         return solution  # which keeps what was read of it
     if not np.any(there):
         raise ValueError("the solution has no time that was reached; there is nothing to draw")
-    kept = {name: np.asarray(getattr(solution, name))[there] for name in solution.by_time}
+    arrays = {name: getattr(solution, name) for name in solution.by_time}
+    kept = {name: np.asarray(array)[there] for name, array in arrays.items() if array is not None}
     if not np.all(np.diff(kept["ts"]) > 0.0):
         kept["ts"] = np.arange(float(len(kept["ts"])))  # a trace may go back
     return dataclasses.replace(solution, **kept)
 
 
 def _between(saved: Moving, moments) -> Moving:
-    """The solution at other times, by Hermite interpolation of the joints' coordinates."""
+    """The solution at other times, by Hermite interpolation of the joints' coordinates; without internal states."""
     times, q, v = (np.asarray(values) for values in (saved.ts, saved.q, saved.v))
     left = np.clip(np.searchsorted(times, moments, side="right") - 1, 0, len(times) - 2)
     width = (times[left + 1] - times[left])[:, None]
@@ -141,7 +142,7 @@ def _between(saved: Moving, moments) -> Moving:
     ends = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * q[left] + (3.0 - 2.0 * s) * s**2 * q[left + 1]
     rate = np.asarray(jax.vmap(partial(rates, saved.mechanism.topology))(q, v))
     slopes = s * (1.0 - s) * width * ((1.0 - s) * rate[left] - s * rate[left + 1])
-    return dataclasses.replace(saved, ts=moments, q=ends + slopes, v=v[left])
+    return dataclasses.replace(saved, ts=moments, q=ends + slopes, v=v[left], internal=None)
 
 
 def _way(saved, body, at):

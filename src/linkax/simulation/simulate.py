@@ -79,8 +79,8 @@ def simulate(
     `max_steps` reached, a step size that falls to nothing. Derivatives of such a run are not a number.
     Warns (`AccuracyWarning`), outside JAX transformations, where rounding keeps the run from its tolerance: a body
     carries one far longer, or branches of the motion are too close to each other. Warns likewise (`StiffnessWarning`)
-    where a stiff spring, damper or beam, and not the motion, chooses the steps, of which there are many. Inside of
-    them `solution.remark()` says so, see `linkax.REMARKS`.
+    where a stiff spring, damper or beam, or a fast internal state, and not the motion, chooses the steps, of which
+    there are many. Inside of them `solution.remark()` says so, see `linkax.REMARKS`.
     """
     require_bool(throw, "throw")
     if optimise is not None:

@@ -10,6 +10,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.constraint_rows import constraint_gamma, constraint_rate, constraint_residual
 from linkax.equations.dynamics import mass_matrix
 from linkax.equations.gaps import gaps
+from linkax.equations.internal_states import bound
 from linkax.equations.loops import jacobian, residual
 from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
@@ -71,12 +72,14 @@ def _not_finite(mechanism):
 
 
 def _forces(solution, system, t, state):
-    """Name a force element whose load is not finite."""
-    motion = move(configure(system, jnp.asarray(t), state.q), state.v)
-    for force in solution.mechanism.forces:
+    """Name a force element whose load is not finite, or a rate of whose internal states."""
+    motion = move(configure(bound(system, state.internal), jnp.asarray(t), state.q), state.v)
+    for force in motion.system.forces:
         load = force.applied(jnp.asarray(t), motion)
         if not all(bool(jnp.all(jnp.isfinite(part))) for part in load):
             return f" The load of {force.display_name} is not finite at t = {float(t):.6g} s."
+        if not bool(jnp.all(jnp.isfinite(force.state_rates(jnp.asarray(t), motion)))):
+            return f" A rate of the internal states of {force.display_name} is not finite at t = {float(t):.6g} s."
     return ""
 
 
@@ -106,7 +109,7 @@ def _no_acceleration(solution, system, method, t):
     if not isinstance(solution.formulation, ClassicalFormulation):
         return ""
     end = solution.end
-    acceleration = solution.formulation.dynamics(system, t, end.q, end.v).acceleration
+    acceleration = solution.formulation.dynamics(bound(system, end.internal), t, end.q, end.v).acceleration
     if np.all(np.isfinite(acceleration)):
         return ""
     rank, rows = int(np.sum(method.constraint_split(system, t, end.q).inverse.rank)), system.topology.num_rows

@@ -1,5 +1,6 @@
 """Remarks on a run that ended well, see `linkax.REMARKS`, and their causes with the elements to blame."""
 
+import functools
 from typing import Any
 
 import diffrax
@@ -10,10 +11,12 @@ import numpy as np
 
 from linkax.equations.configuration import along_speeds, configure
 from linkax.equations.coordinates import retract
+from linkax.equations.internal_states import bound, internal_rates
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.linalg.spectral_radius import spectral_radius
 from linkax.linalg.triangular import cholesky_inverse
+from linkax.model.internal_states import shapes_of, size_of
 from linkax.simulation.explain.diagnosis import lost_inertia
 from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS, Solution
 from linkax.simulation.integrate.rosenbrock import Rodas5P
@@ -150,13 +153,15 @@ def _stiff(solution):
     (rates, damping), step = map(np.asarray, _rates(*_ends(solution))), float(_mean_step(solution))
     fastest = int(np.argmax(rates))
     suits_implicit = _suits_implicit(solution, np.asarray, damping)
-    advice = "take a rigid joint or constraint in its place"
+    has_states = bool(solution.mechanism.forces[fastest].states)
+    other = "a force without its internal states" if has_states else "a rigid joint or constraint"
+    advice = f"take {other} in its place"
     if _is_implicit(solution) and not suits_implicit:
         advice = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
     elif not _is_implicit(solution) and suits_implicit and rates[fastest] * step > UNSTABLE:
         advice = (
             "take solver=linkax.Rodas5P(), which steps over it where it has come to rest or the tolerance is loose, or "
-            "a rigid joint or constraint in its place"
+            f"{other} in its place"
         )
     return (
         f" {solution.mechanism.forces[fastest].display_name}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not "
@@ -205,29 +210,68 @@ def _scales(mechanism, tangent_space, t, state):
 
 @Program
 def _rates(mechanism, tangent_space, t, state):
-    """The fastest rate of each force element [1/s], (..., n), √(k / m) or c / m; and the largest c / m, (...)."""
+    """The fastest rate of each force element [1/s], (..., n), √(k / m), c / m or that of its internal states; and the
+    largest c / m, or rate at which such states settle by themselves, (...).
+    """
     return _per_member(_rates_of_elements, mechanism, tangent_space, t, state)
 
 
 def _rates_of_elements(mechanism, tangent_space, t, state):
-    gram, *matrices = _elements(mechanism, tangent_space, t, state)
+    gram, *matrices, whole = _elements(mechanism, tangent_space, t, state)
     stays = jnp.diagonal(gram) <= 0.0
     to_speeds, _ = cholesky_inverse(gram + jnp.diag(stays.astype(gram.dtype)))
     largest = lambda of: spectral_radius(to_speeds @ of @ to_speeds.T)
     stiffness, damping = map(largest, matrices)
-    return jnp.maximum(jnp.sqrt(stiffness), damping), jnp.max(damping)
+    rates = jnp.maximum(jnp.sqrt(stiffness), damping)
+    if whole is None:
+        return rates, jnp.max(damping)
+    of_states, settling = whole(to_speeds @ to_speeds.T)
+    return jnp.maximum(rates, of_states), jnp.maximum(jnp.max(damping), jnp.max(settling))
 
 
 def _elements(mechanism, tangent_space, t, state):
-    """Mass matrix on the tangent space, and stiffness and damping of each force element there, (n, n_v, n_v)."""
-    system = system_of(mechanism, state.q.dtype)
+    """Mass matrix on the tangent space, and stiffness and damping of each force element there, (n, n_v, n_v); and what
+    internal states add, see `_with_states`, None without any.
+    """
+    system = bound(system_of(mechanism, state.q.dtype), state.internal)
     found = tangent_space.prepared(system.dtype).at_rest(system, t, state.q)
     basis, still = found.split.inverse.basis, jnp.zeros_like(state.v)
 
-    def forces(change, faster):
-        motion = move(configure(system, t, retract(system.topology, state.q, basis @ change)), state.v + basis @ faster)
-        loads = [force.applied(t, motion) for force in mechanism.forces]
+    def moved(change, faster, internal):
+        place = retract(system.topology, state.q, basis @ change)
+        return move(configure(bound(system, internal), t, place), state.v + basis @ faster)
+
+    def forces(change, faster, internal=state.internal):
+        motion = moved(change, faster, internal)
+        loads = [force.applied(t, motion) for force in motion.system.forces]
         along = lambda load: load.joint_force + along_speeds(motion.configuration, load.force, load.moment)
         return jnp.stack([along(load) @ basis for load in loads])
 
-    return basis.T @ found.mass @ basis, *jax.jacfwd(forces, (0, 1))(still, still)
+    gram = basis.T @ found.mass @ basis
+    if state.internal is None:
+        return gram, *jax.jacfwd(forces, (0, 1))(still, still), None
+    rates = lambda *changes: internal_rates(moved(*changes))
+    of_forces, of_rates = (jax.jacfwd(of, (0, 1, 2))(still, still, state.internal) for of in (forces, rates))
+    counts = [size_of(shapes_of(force.states)) for force in mechanism.forces]
+    owns = np.repeat(np.arange(len(counts)), counts) == np.arange(len(counts))[:, None]
+    return gram, *of_forces[:2], functools.partial(_with_states, of_forces, of_rates, owns)
+
+
+def _with_states(of_forces, of_rates, owns, inverse_mass):
+    """The fastest rate of each force element with its internal states, and that of the states alone, (n,) each.
+
+    **Arguments:** derivatives of forces, (n, n_v, …), and rates, (n_s, …), by coordinates, speeds and states; which
+    states each element `owns`, (n, n_s); the inverse of the mass matrix.
+    """
+    own = jnp.asarray(owns, inverse_mass.dtype)
+    stiffness, damping, by_states = (inverse_mass @ part for part in of_forces)
+    by_states = by_states * own[:, None, :]
+    by_q, by_v, alone = (part * own[:, :, None] for part in of_rates)
+    alone = alone * own[:, None, :]
+    speeds = jnp.broadcast_to(jnp.eye(len(inverse_mass), dtype=own.dtype), damping.shape)
+    rows = [
+        [jnp.zeros_like(damping), speeds, jnp.zeros_like(by_states)],
+        [stiffness, damping, by_states],
+        [by_q, by_v, alone],
+    ]
+    return spectral_radius(jnp.block(rows)), spectral_radius(alone)

@@ -32,7 +32,7 @@ from linkax.xla.arrays import Array
 class StepError(NamedTuple):
     """What `ProjectedSolver` tells `MechanismControl` of a step.
 
-    - `error`: estimate of q and v, or None.
+    - `error`: estimates of q and v, and of internal states where there are some, or None.
     - `leaves`: distance d from the nearest singular configuration where the step begins.
     - `passes`: the smallest d of its other stages. `retry`: by how much to change the step so that
       what passes there falls between two stages.
@@ -56,20 +56,30 @@ class SolverState(NamedTuple):
 
 
 def pack(
-    sides: Sides, q: Float[Array, " n_q"], v: Float[Array, " n_v"], integral: Float[Array, ""] | float
+    sides: Sides,
+    q: Float[Array, " n_q"],
+    v: Float[Array, " n_v"],
+    internal: Float[Array, " n_s"] | None,
+    integral: Float[Array, ""] | float,
 ) -> Float[Array, " n"]:
-    """The vector y that diffrax integrates: sides of switches, if any, q, v, and ∫ d dt; or its rates."""
+    """The vector y that diffrax integrates: sides of switches, if any, q, v, internal states, if any, and ∫ d dt; or
+    its rates.
+    """
     first: list[Any] = [sides] if len(sides) else []
-    return jnp.concatenate([*first, q, v, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
+    later: list[Any] = [] if internal is None else [internal]
+    return jnp.concatenate([*first, q, v, *later, jnp.reshape(jnp.asarray(integral, q.dtype), (1,))])
 
 
 def unpack(
-    topology: Topology, y: Float[Array, "*batch n"]
-) -> tuple[Float[Array, "*batch k"], Float[Array, "*batch n_q"], Float[Array, "*batch n_v"]]:
-    """Sides, q and v of vectors y, (..., k + n_q + n_v + 1)."""
-    first = y.shape[-1] - topology.num_coordinates - topology.num_speeds - 1
+    topology: Topology, num_states: int, y: Float[Array, "*batch n"]
+) -> tuple[
+    Float[Array, "*batch k"], Float[Array, "*batch n_q"], Float[Array, "*batch n_v"], Float[Array, "*batch n_s"] | None
+]:
+    """Sides, q, v and internal states, None for none, of vectors y, (..., k + n_q + n_v + n_s + 1)."""
+    first = y.shape[-1] - topology.num_coordinates - topology.num_speeds - num_states - 1
     middle = first + topology.num_coordinates
-    return y[..., :first], y[..., first:middle], y[..., middle:-1]
+    last = middle + topology.num_speeds
+    return y[..., :first], y[..., first:middle], y[..., middle:last], y[..., last:-1] if num_states else None
 
 
 def integral_of_distance(y: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:

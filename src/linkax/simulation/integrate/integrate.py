@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from linkax.equations.internal_states import bound
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
@@ -98,9 +99,9 @@ def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     inputs = run.flat, initial.state, t0, t1, dt0, saveat
     if not saves_states(saveat):
         saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))
-    q, v = initial.state.q, initial.state.v
-    sides = start_sides(problem.system, t0, q, v) if control.is_adaptive else ()
-    y0, event = problem.packed(q, v, sides), _wrapped_event(options.event)
+    q, v, internal = initial.state.q, initial.state.v, initial.state.internal
+    sides = start_sides(bound(problem.system, internal), t0, q, v) if control.is_adaptive else ()
+    y0, event = problem.packed(q, v, sides, internal), _wrapped_event(options.event)
     solver = ProjectedSolver.around(options.solver, run.accuracy, run.adjoint, control)
     meter = diffrax.NoProgressMeter() if options.progress_meter is None else options.progress_meter
     integrator = Integrator(dt0, saveat, solver, control, run.adjoint, event, meter, options.max_steps)

@@ -8,9 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from linkax.equations.configuration import configure
 from linkax.equations.coordinates import rates, speeds
+from linkax.equations.internal_states import bound, internal_rates, num_states
+from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation
+from linkax.model.internal_states import scales
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack
@@ -20,7 +24,8 @@ from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.tracing import jit_inline
 
-Errors = tuple[Float[Array, " n_v"], Float[Array, " n_v"]]  # of coordinates and speeds, as changes of both
+# Of coordinates and speeds, as changes of both, and of internal states where there are some.
+Errors = tuple[Float[Array, " _"], ...]
 
 
 class Problem(eqx.Module):
@@ -39,17 +44,36 @@ class Problem(eqx.Module):
     closed_at: Float[Array, ""] | float = np.inf
     from_singular: Bool[Array, ""] | bool = False
 
-    def packed(self, q: Float[Array, " n_q"], v: Float[Array, " n_v"], sides: Sides = ()) -> Float[Array, " n"]:
+    def packed(
+        self,
+        q: Float[Array, " n_q"],
+        v: Float[Array, " n_v"],
+        sides: Sides = (),
+        internal: Float[Array, " n_s"] | None = None,
+    ) -> Float[Array, " n"]:
         """The vector y of a state where the run begins."""
-        return pack(sides, q, v, 0.0)
+        return pack(sides, q, v, internal, 0.0)
 
     def unpacked(self, y: Float[Array, "*batch n"]) -> tuple[Float[Array, "*batch n_q"], Float[Array, "*batch n_v"]]:
         """q and v of vectors y."""
-        return unpack(self.system.topology, y)[1:]
+        return self._parts(y)[1:3]
+
+    def internal(self, y: Float[Array, "*batch n"]) -> Float[Array, "*batch n_s"] | None:
+        """Internal states of force elements in vectors y; None where they have none."""
+        return self._parts(y)[3] if num_states(self.system) else None
+
+    def _parts(self, y):
+        return unpack(self.system.topology, num_states(self.system), y)
+
+    @property
+    def scales(self) -> tuple[Float[Array, " _"], ...]:
+        """Scales of `Errors`: of coordinates and of speeds, and of internal states where there are some."""
+        of_motion, forces = self.system.scales, self.system.forces
+        return of_motion, of_motion, *([scales(forces, of_motion.dtype)] if num_states(self.system) else [])
 
     def sides(self, y: Float[Array, " n"]) -> Sides:
         """The sides of switches on which force elements are held, (m,); none where steps do not adapt to them."""
-        sides = unpack(self.system.topology, y)[0]
+        sides = self._parts(y)[0]
         return sides if len(sides) else ()
 
     def on_sides(self, y: Float[Array, " n"], sides: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -58,37 +82,43 @@ class Problem(eqx.Module):
 
     def switches(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " m"]:
         """Values of the switches at a vector, (m,)."""
-        return values(self.system, t, *self.unpacked(y))
+        return values(bound(self.system, self.internal(y)), t, *self.unpacked(y))
 
     def errors(self, y: Float[Array, " n"], error: Float[Array, " n"]) -> Errors:
-        """Error estimates of q and v at a vector y, as changes (n_v,) of both."""
-        of_q, of_v = self.unpacked(error)
-        return speeds(self.system.topology, self.unpacked(y)[0], of_q), of_v
+        """Error estimates of q and v at a vector y, as changes (n_v,) of both, and of internal states, if any."""
+        _, of_q, of_v, of_internal = self._parts(error)
+        of_motion = speeds(self.system.topology, self.unpacked(y)[0], of_q), of_v
+        return of_motion if of_internal is None else (*of_motion, of_internal)
 
     @jit_inline
     @straight_line
     def derivative(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " n"]:
-        """ẏ = (0, q̇, v̇, d) at (t, y)."""
+        """ẏ = (0, q̇, v̇, ṡ, d) at (t, y), ṡ of internal states."""
         correct = self.accuracy.projection in ("both", "stage") and t != self.closed_at
-        sides = self.sides(y)
-        system = held(self.system, sides) if len(sides) else self.system
+        sides, internal = self.sides(y), self.internal(y)
+        system = bound(self.system, internal)
+        system = held(system, sides) if len(sides) else system
         v, acceleration, q, distance = self.method.derivative(system, t, *self.unpacked(y), correct)
         still = jax.tree.map(jnp.zeros_like, sides)
-        return pack(still, rates(system.topology, q, v), acceleration, distance)
+        changes = None if internal is None else internal_rates(move(configure(system, t, q), v))
+        return pack(still, rates(system.topology, q, v), acceleration, changes, distance)
 
     @jit_inline
     @straight_line
     def corrected(
         self, t: Float[Array, ""], y: Float[Array, " n"], error: Float[Array, " n"] | None = None
-    ) -> tuple[Float[Array, " n"], tuple[Float[Array, " n_v"], ...] | None, Float[Array, ""]]:
+    ) -> tuple[Float[Array, " n"], Errors | None, Float[Array, ""]]:
         """A vector after a step and its error estimate, both corrected, and the distance d there."""
         errors = () if error is None else self.errors(y, error)
-        q, v, errors, distance = self.method.correct(self.system, t, *self.unpacked(y), errors)
-        return pack(self.sides(y), q, v, integral_of_distance(y)), None if error is None else errors, distance
+        of_motion, of_internal = errors[:2], errors[2:]
+        q, v, of_motion, distance = self.method.correct(self.system, t, *self.unpacked(y), of_motion)
+        errors = None if error is None else (*of_motion, *of_internal)
+        return pack(self.sides(y), q, v, self.internal(y), integral_of_distance(y)), errors, distance
 
     def close(self, t: Float[Array, ""], y: Float[Array, " n"]) -> State:
         """The `State` on the manifold to rounding."""
-        return State(*self.method.close(self.system, t, *self.unpacked(y)), self.system.topology)
+        q, v = self.method.close(self.system, t, *self.unpacked(y))
+        return State(q, v, self.system.topology, self.internal(y))
 
 
 def derivative(t: Any, y: Float[Array, " n"], problem: Problem) -> Float[Array, " n"]:

@@ -54,10 +54,12 @@ class StageNorm(eqx.Module):
 
     def __call__(self, change: Float[Array, " n"]) -> Float[Array, ""]:
         problem, (rtol, atol) = self.problem, self.tolerances
-        scales, (of_q, of_v) = problem.system.scales, problem.errors(self.y0, self.duration * change)
-        fastest = problem.system.fastest(problem.unpacked(self.y0)[1])
-        of_q, of_v = of_q / scales / (rtol + atol), of_v / scales / (rtol * fastest + atol)
-        return jnp.max(jnp.abs(jnp.concatenate([of_q, of_v])), initial=0.0)
+        errors, internal = problem.errors(self.y0, self.duration * change), problem.internal(self.y0)
+        sizes = [1.0, problem.system.fastest(problem.unpacked(self.y0)[1])]
+        sizes += [] if internal is None else [jnp.abs(internal / problem.scales[2])]
+        allowed = [scale * (rtol * size + atol) for scale, size in zip(problem.scales, sizes, strict=True)]
+        scaled = [error / most for error, most in zip(errors, allowed, strict=True)]
+        return jnp.max(jnp.abs(jnp.concatenate(scaled)), initial=0.0)
 
 
 class Chord(diffrax.VeryChord):

@@ -97,8 +97,9 @@ class REMARKS(eqx.Enumeration):
         "one to another."
     )
     stiff = (
-        "A stiff spring, damper or beam, and not the motion, chooses the steps. Take a rigid joint or "
-        "constraint in its place; or with an explicit solver, where it comes to rest, solver=linkax.Rodas5P()."
+        "A stiff spring, damper or beam, or a fast internal state of a force element, and not the motion, chooses the "
+        "steps. Take a rigid joint or constraint in its place, or a force without that state; or with an explicit "
+        "solver, where it comes to rest, solver=linkax.Rodas5P()."
     )
 
 

@@ -30,6 +30,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     The controller inside sees coordinates in radians and lengths of the mechanism, all of
     magnitude one, and speeds in the same scales, all of the magnitude of the largest: a joint
     that has made many turns, or that stands still for a moment, does not change the tolerance.
+    Internal states of force elements it sees in scales of their own.
     The error it sees has rounding taken off, which no smaller step would lower, and which grows
     near a singular configuration.
 
@@ -76,14 +77,15 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         func: Any,
         error_order: Any,
     ) -> tuple[Any, tuple[Any, Int[Array, ""]]]:
-        _, v = args.unpacked(y0)
+        (_, v), internal = args.unpacked(y0), args.internal(y0)
         if dt0 is None and self.is_adaptive:
             # Not diffrax's choice, which would compile the equations of motion twice more.
             most = jnp.where(args.from_singular, FIRST_TURN_SINGULAR, FIRST_TURN)
             turning = ratio(most, args.system.fastest(v), jnp.inf)
             dt0 = jnp.minimum(FIRST_STEP * (t1 - t0), turning)
             dt0 = lax.stop_gradient(dt0)
-        first, state = self.controller.init(terms, t0, t1, (v, v), dt0, args, func, error_order)
+        alike = (v, v) if internal is None else (v, v, internal)
+        first, state = self.controller.init(terms, t0, t1, alike, dt0, args, func, error_order)
         return first, (state, jnp.zeros((), int))
 
     def adapt_step_size(
@@ -132,24 +134,27 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         )
 
     def _scaled_error(self, problem, y_error, magnitude, candidate):
-        """The error of q and v in the scales of the mechanism, with rounding taken off."""
-        scales = problem.system.scales
+        """The error of q, v and internal states in their scales, with rounding taken off."""
+        scales = problem.scales
         noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), problem.method.distance_floor)
         # The second is none where the step has led to no numbers.
         largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), magnitude, candidate)
         # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
-        least = jnp.minimum(SEEN_ULPS * jnp.finfo(scales.dtype).eps, SEEN * self.innermost.rtol)
+        least = jnp.minimum(SEEN_ULPS * jnp.finfo(scales[0].dtype).eps, SEEN * self.innermost.rtol)
         return tuple(
-            jnp.maximum(jnp.abs(_less(e / scales, noise * scale)), least * scale)
-            for e, scale in zip(y_error.error, largest, strict=True)
+            jnp.maximum(jnp.abs(_less(e / scale, noise * size)), least * size)
+            for e, scale, size in zip(y_error.error, scales, largest, strict=True)
         )
 
 
 def _magnitudes(problem, y):
-    """The magnitudes that tolerances are relative to: one for coordinates, the largest speed for speeds."""
-    q, v = problem.unpacked(y)
+    """The magnitudes that tolerances are relative to: one for coordinates, the largest speed for speeds, its own for
+    each internal state.
+    """
+    (q, v), internal = problem.unpacked(y), problem.internal(y)
     fastest = jnp.broadcast_to(problem.system.fastest(v), v.shape)
-    return jnp.where(jnp.all(jnp.isfinite(q)), jnp.ones_like(v), jnp.nan), fastest
+    of_motion = jnp.where(jnp.all(jnp.isfinite(q)), jnp.ones_like(v), jnp.nan), fastest
+    return of_motion if internal is None else (*of_motion, jnp.abs(internal / problem.scales[2]))
 
 
 def _noise(distance, nearest):

@@ -41,6 +41,9 @@ class Held(eqx.Module):
     def applied(self, t: Time, motion: Motion) -> Load:
         return self.force.applied(t, motion, self.side > 0.0)
 
+    def state_rates(self, t: Time, motion: Motion) -> Float[jax.Array, " n"]:
+        return self.force.state_rates(t, motion, self.side > 0.0)
+
 
 def held(system: System, sides: Sides) -> System:
     """Hold the force elements of a system on the given sides of their switches, (m,), 1 or −1."""

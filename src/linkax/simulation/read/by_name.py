@@ -6,6 +6,7 @@ Names share programs: what is named comes as a traced index, or is taken out of 
 from collections.abc import Callable
 from typing import Any, get_args
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, Shaped
@@ -13,8 +14,10 @@ from jaxtyping import Float, Int, Shaped
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.model.beams import Beam
 from linkax.model.elements import AbstractElement
+from linkax.model.forces import AbstractForce
+from linkax.model.internal_states import by_name, size_of
 from linkax.model.joints.distance import Distance
-from linkax.model.names import find
+from linkax.model.names import ByName, find
 from linkax.model.numbers import Number, Vector, number, one_of, real
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
@@ -103,6 +106,33 @@ def force_of(solution: Solution, element: str | AbstractElement | Distance) -> F
     if of == "joints":
         return read_in_motion(Observables.tension, solution, index)
     return of_constraint(Observables.constraint_forces, solution, solution.mechanism.topology.constraints[index])
+
+
+def states_of(solution: Solution, element: str | AbstractForce) -> dict[str, Float[Array, "..."]]:
+    """Take the internal states of a force element, by name.
+
+    **Raises:** `ValueError` for an unknown element, for one without, and for a solution that saved no states.
+    """
+    of, index = _place(solution, element)
+    shapes, names = _shapes_of_states(solution), solution.mechanism.force_names
+    if of != "forces" or not shapes[index]:
+        having = ", ".join(repr(name) for name, found in zip(names, shapes, strict=True) if found)
+        raise ValueError(f"{element!r} has no internal states; known: {having or 'none'}")
+    if solution.internal is None:
+        raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
+    start = sum(size_of(found) for found in shapes[:index])
+    values = solution.internal[..., start : start + size_of(shapes[index])]
+    return ByName(by_name(shapes[index], values), "internal state")
+
+
+def _shapes_of_states(solution) -> list[dict[str, tuple[int, ...]]]:
+    """Shapes of the internal states of each force element, of one member of a batch."""
+    of_member = lambda mechanism: [dict(force.states) for force in mechanism.forces]
+    axes = solution.ts.ndim - 1
+    for _ in range(axes):
+        of_member = eqx.filter_vmap(of_member)
+    found = eqx.filter_eval_shape(of_member, solution.mechanism)
+    return [{name: state.initial.shape[axes:] for name, state in states.items()} for states in found]
 
 
 def length_of(solution: Solution, element: str | AbstractElement | Distance) -> Float[Array, "*batch n_t"]:

@@ -13,8 +13,7 @@ from linkax.model.numbers import Number, Vector, is_finite, real, require
 from linkax.model.topology import Topology
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
-from linkax.simulation.read.reading import read
-from linkax.xla.arrays import Array
+from linkax.simulation.read.reading import read, read_in_motion
 from linkax.xla.tracing import concrete, jit_inline
 
 ROUNDING = 1e-9  # of the time between the first and the last saved one: how far beyond them a time may lie
@@ -63,8 +62,10 @@ def _check_within(asked, saved):
 def _between(solution, ts):
     acceleration = read(Observables.solve, solution).acceleration
     states = solution.ts, solution.q, solution.v, acceleration
-    ts, q, v = _interpolated(solution.mechanism.topology, ts.astype(solution.ts.dtype), *states)
-    return dataclasses.replace(solution, ts=ts, q=q, v=v)
+    if solution.internal is not None:
+        states = *states, solution.internal, *read_in_motion(Observables.internal_changes, solution)
+    ts, q, v, *internal = _interpolated(solution.mechanism.topology, ts.astype(solution.ts.dtype), *states)
+    return dataclasses.replace(solution, ts=ts, q=q, v=v, internal=internal[0] if internal else None)
 
 
 @jit_inline
@@ -76,7 +77,7 @@ def _interpolated(topology: Topology, ts, *states):
 
 
 def _of_member(topology, ts, states):
-    """Times, coordinates and speeds at times of one motion; infinity at those that it did not reach."""
+    """Times, coordinates, speeds, internal states at times of one motion; infinity at those that it did not reach."""
     saved = states[0]
     index = jnp.clip(jnp.searchsorted(saved, ts) - 1, 0, len(saved) - 2)
     first, last = saved[0], jnp.max(jnp.where(jnp.isfinite(saved), saved, -jnp.inf))
@@ -93,13 +94,25 @@ def _of_member(topology, ts, states):
     return [mask(part) for part in found]
 
 
-def _at(topology, t, before, later) -> tuple[Any, Array, Array]:
-    """The state at a time between two states, by the polynomial of degree five through q, q̇ and q̈ at both."""
+def _at(topology, t, before, later) -> tuple[Any, ...]:
+    """The state at a time between two states, by the polynomial of degree five through q, q̇ and q̈ at both; internal
+    states likewise.
+    """
     rate = lambda q, v: rates(topology, q, v)
     curve = lambda q, v, acceleration: jax.jvp(rate, (q, v), (rate(q, v), acceleration))
-    (start, q, v, acceleration), (end, q1, *ends) = before, later
+    (start, q, v, acceleration, *internal), (end, q1, v1, acceleration1, *internal1) = before, later
     h = jnp.where(end > start, end - start, 1.0)
-    (slope, bend), (slope1, bend1) = curve(q, v, acceleration), curve(q1, *ends)
+    path = _quintic(h, (q, *curve(q, v, acceleration)), (q1, *curve(q1, v1, acceleration1)))
+    place = lambda s: on_manifold(topology, path(s))
+    s = (t - start) / h
+    here, along = jax.jvp(place, (s,), (jnp.ones_like(s),))
+    states = [_quintic(h, internal, internal1)(s)] if internal else []
+    return t, here, speeds(topology, here, along / h), *states
+
+
+def _quintic(h, before, later):
+    """The polynomial of s in [0, 1] through values and their first two derivatives by time at both ends, h apart."""
+    (q, slope, bend), (q1, slope1, bend1) = before, later
     first, second = h * slope, h**2 * bend / 2.0
     moved, faster, bent = q1 - q - first - second, h * slope1 - first - 2.0 * second, h**2 * (bend1 - bend)
     third, fourth, fifth = (
@@ -107,7 +120,4 @@ def _at(topology, t, before, later) -> tuple[Any, Array, Array]:
         -15.0 * moved + 7.0 * faster - bent,
         6.0 * moved - 3.0 * faster + bent / 2.0,
     )
-    place = lambda s: on_manifold(topology, q + s * (first + s * (second + s * (third + s * (fourth + s * fifth)))))
-    s = (t - start) / h
-    here, along = jax.jvp(place, (s,), (jnp.ones_like(s),))
-    return t, here, speeds(topology, here, along / h)
+    return lambda s: q + s * (first + s * (second + s * (third + s * (fourth + s * fifth))))

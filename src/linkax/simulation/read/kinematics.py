@@ -30,15 +30,17 @@ class Kinematics(eqx.Module):
     """Coordinates, and their changes, of a mechanism's joints at `ts`, read by the names of bodies and joints.
 
     - `run`: what moves. `q`, `v`: coordinates and speeds of the tree's joints, (n_t, n_q) and (n_t, n_v).
+    - `internal`: internal states of force elements, (n_t, n_s); None where there are none.
     - `rank_nearby`: rank along the motion, see `linkax.Solution`; None where it is not known.
     """
 
-    by_time: ClassVar[tuple[str, ...]] = ("ts", "q", "v")  # names of the arrays with times as an axis
+    by_time: ClassVar[tuple[str, ...]] = ("ts", "q", "v", "internal")  # names of the arrays with times as an axis
 
     run: eqx.AbstractVar[Run]
     ts: eqx.AbstractVar[Float[Array, "*batch n_t"] | Any]
     q: eqx.AbstractVar[Float[Array, "*batch n_t n_q"] | Any]
     v: eqx.AbstractVar[Float[Array, "*batch n_t n_v"] | Any]
+    internal: eqx.AbstractVar[Float[Array, "*batch n_t n_s"] | Any]
     rank_nearby: eqx.AbstractVar[Int[Array, "*batch k"] | None]
 
     @property

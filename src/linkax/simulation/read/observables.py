@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from linkax.equations.configuration import Configuration, along_speeds, beam_point, configure
 from linkax.equations.coordinates import rates
 from linkax.equations.dynamics import body_accelerations, kinetic_energy, potential_energy
+from linkax.equations.internal_states import bound, internal_rates
 from linkax.equations.loops import immobile_residual, jacobian, rate, residual, sorted_multipliers
 from linkax.equations.motion import Motion, move
 from linkax.equations.reactions import Axes, Reaction, Side, reactions, reactions_to, seen_from
@@ -66,6 +67,7 @@ class Observables(NamedTuple):
 
     - `method`: the formulation that moved it. `tangent_space`: splits into normal and tangent space.
     - `dynamics`: what `solve` returns, for functions that need accelerations or multipliers.
+    - `internal`: internal states of force elements, to which those of `system` are bound; None where they have none.
     """
 
     system: System
@@ -75,6 +77,7 @@ class Observables(NamedTuple):
     q: Float[Array, " n_q"]
     v: Float[Array, " n_v"]
     dynamics: Dynamics | None = None
+    internal: Float[Array, " n_s"] | None = None
 
     @property
     def configuration(self) -> Configuration:
@@ -208,14 +211,32 @@ class Observables(NamedTuple):
         """Of each of the force elements that `do_work`, beyond the fall of its potential energy."""
         motion, configuration, system = self.motion, self.configuration, self.system
         forces = [system.forces[index] for index in do_work(system)[0]]
-        energies = lambda q: [force.potential_energy(configure(system, self.t, q)) for force in forces]
-        _, rises = jax.jvp(energies, (self.q,), (rates(system.topology, self.q, self.v),))
+
+        def energies(q, internal=None):
+            of = bound(system, internal)
+            return [of.forces[index].potential_energy(configure(of, self.t, q)) for index in do_work(of)[0]]
+
+        at, changes = (self.q,), (rates(system.topology, self.q, self.v),)
+        if self.internal is not None:
+            at, changes = (*at, self.internal), (*changes, internal_rates(motion))
+        _, rises = jax.jvp(energies, at, changes)
         found = [jnp.zeros(0, self.q.dtype)]
         for force, rise in zip(forces, rises, strict=True):
             load = force.applied(self.t, motion)
             along = load.joint_force + along_speeds(configuration, load.force, load.moment)
             found.append((along @ self.v + rise)[None])
         return jnp.concatenate(found)
+
+    def internal_changes(self) -> tuple[Float[Array, " n_s"], Float[Array, " n_s"]]:
+        """First and second derivatives by time of the internal states."""
+
+        def changes(t, q, v, internal):
+            return internal_rates(move(configure(bound(self.system, internal), t, q), v))
+
+        at = self.t, self.q, self.v, self.internal
+        first = changes(*at)
+        along = jnp.ones_like(self.t), rates(self.system.topology, self.q, self.v), self.solved.acceleration, first
+        return jax.jvp(changes, at, along)
 
     def powers_of_drives(self) -> Float[Array, " n"]:
         """Of each of the constraints that `do_work`."""

@@ -186,7 +186,8 @@ def _polished(solution, pair, time, q) -> _Passage:
     begin, accuracy = pair.ts[0], pair.ts[1] - pair.ts[0]
     if not has_parts(solution):
         return _Passage(float(time), q, float(accuracy))
-    state = State(jnp.asarray(pair.q[0]), jnp.asarray(pair.v[0]), solution.mechanism.topology)
+    internal = None if solution.internal is None else solution.at([begin]).internal[0]
+    state = State(jnp.asarray(pair.q[0]), jnp.asarray(pair.v[0]), solution.mechanism.topology, internal)
     for _ in range(POLISHES):
         aside = ASIDE * (time - begin)
         part = solution.another(part_of_run(solution, state, np.array([begin, time - aside, time + aside])))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Float, Int
 
+from linkax.equations.internal_states import bound
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation, Dynamics
 from linkax.formulations.tangent_space import TangentSpace
@@ -62,7 +63,7 @@ def _asked(solution, function, dynamics, details):
     """The program that reads, and its arguments."""
     topology, run = solution.mechanism.topology, solution.run
     few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
-    states = solution.ts, solution.q, solution.v
+    states = solution.ts, solution.q, solution.v, solution.internal
     motion = SavedMotion(run.flat, run.formulation, run.tangent_space, solution.rank_nearby, *states)
     return _of_few if few else _of_many, function, motion, dynamics, details
 
@@ -77,6 +78,7 @@ class SavedMotion(NamedTuple):
     ts: Float[Array, "*batch n_t"]
     q: Float[Array, "*batch n_t n_q"]
     v: Float[Array, "*batch n_t n_v"]
+    internal: Float[Array, "*batch n_t n_s"] | None
 
 
 def kept(solution: Solution, key: Hashable, compute: Callable[[], Any]) -> Any:
@@ -102,11 +104,15 @@ def _of_times(function, motion: SavedMotion, dynamics, details):
         tangent_space = motion.tangent_space.prepared(dtype, motion.rank_nearby)
         method = motion.formulation.prepared(dtype, motion.rank_nearby)
 
-        def of_time(t, q, v, *dynamics):
-            found = Dynamics(*dynamics) if dynamics else None
-            return straight_line(function)(Observables(system, method, tangent_space, t, q, v, found), *details)
+        states = [] if motion.internal is None else [motion.internal]
 
-        return map_saved_times(of_time, jnp.isfinite(motion.ts), motion.ts, motion.q, motion.v, *dynamics)
+        def of_time(t, q, v, *others):
+            (internal,), dynamics = (others[:1], others[1:]) if states else ((None,), others)
+            found = Dynamics(*dynamics) if dynamics else None
+            at = Observables(bound(system, internal), method, tangent_space, t, q, v, found, internal)
+            return straight_line(function)(at, *details)
+
+        return map_saved_times(of_time, jnp.isfinite(motion.ts), motion.ts, motion.q, motion.v, *states, *dynamics)
 
     for _ in range(motion.ts.ndim - 1):
         of_member = eqx.filter_vmap(of_member)

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.elements import AbstractElement
+from linkax.model.forces import AbstractForce
 from linkax.model.joints.distance import Distance
 from linkax.model.mechanism import Mechanism
 from linkax.model.names import ByName
@@ -28,6 +29,7 @@ from linkax.simulation.read.by_name import (
     is_constraint,
     of_constraint,
     reaction_of,
+    states_of,
 )
 from linkax.simulation.read.interpolation import motion_at
 from linkax.simulation.read.kinematics import Kinematics
@@ -52,6 +54,7 @@ class Solution(Kinematics):
     - `run`: what was integrated, and how; its `mechanism`, `formulation` and `accuracy` are the solution's own.
     - `q`, `v`: coordinates and speeds of the tree's joints, (n_t, n_q) and (n_t, n_v), on the
       closed loops with the paper's formulation. Times that were not reached hold infinity.
+    - `internal`: internal states of force elements, (n_t, n_s), which `states` has by name; None where there are none.
     - `ys`: what a `SaveAt` with functions of its own saved; `q` and `v` are None then.
     - `t_end`, `end`: the time reached and the `State` there.
     - `stats`: as in diffrax: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
@@ -71,6 +74,7 @@ class Solution(Kinematics):
     ts: Float[Array, "*batch n_t"] | Any
     q: Float[Array, "*batch n_t n_q"] | Any
     v: Float[Array, "*batch n_t n_v"] | Any
+    internal: Float[Array, "*batch n_t n_s"] | Any
     ys: Any
     t_end: Float[Array, "*batch"]
     end: State
@@ -101,6 +105,7 @@ class Solution(Kinematics):
             ts=integrated.ts,
             q=None if saved is None else saved.q,
             v=None if saved is None else saved.v,
+            internal=None if saved is None else saved.internal,
             ys=integrated.ys if saved is None else None,
             t_end=integrated.t_end,
             end=end,
@@ -143,6 +148,7 @@ class Solution(Kinematics):
             ts=t[None],
             q=state.q[None],
             v=state.v[None],
+            internal=None if state.internal is None else state.internal[None],
             ys=None,
             t_end=t,
             end=state,
@@ -241,6 +247,17 @@ class Solution(Kinematics):
         **Raises:** `ValueError` for an unknown element, and for one that does not say which force it has.
         """
         return force_of(self, element)
+
+    def states(self, element: str | AbstractForce) -> dict[str, Float[Array, "..."]]:
+        """Internal states of a force element by name, such as currents and pressures, (n_t, ...) each.
+
+        Units are those of the element's `states`.
+
+        **Arguments:** `element`: its name, one of `mechanism.force_names`, or the element itself.
+
+        **Raises:** `ValueError` for an unknown element, and for one without internal states.
+        """
+        return states_of(self, element)
 
     def violation(self) -> Violation:
         """Largest violation of the loop rows at each time."""

@@ -11,6 +11,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
 from linkax.equations.gaps import gaps
 from linkax.linalg.saddle_inverse import invert
+from linkax.model.internal_states import initial_values
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, whole_number
 from linkax.simulation.start.assembly import AssemblyWarning, assemble, demand_of
@@ -86,8 +87,9 @@ def assemblies(
         )
     if not distinct:
         return [assemble(mechanism, positions, t=t)]  # which tries harder, or tells why not
-    state = lambda index: State(jnp.asarray(found.q[index]), jnp.asarray(found.v[index]), mechanism.topology)
-    return [state(index) for index in distinct]
+    internal = initial_values(mechanism.forces, found.q.dtype)
+    of = lambda index: (jnp.asarray(found.q[index]), jnp.asarray(found.v[index]))
+    return [State(*of(index), mechanism.topology, internal) for index in distinct]
 
 
 class _Found(NamedTuple):

@@ -1,5 +1,6 @@
 """Consistent states from partial positions and speeds."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, on_manifold
 from linkax.equations.gaps import gaps
 from linkax.equations.system import system_of
+from linkax.model.internal_states import initial_values
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number
 from linkax.simulation.start.branch_speeds import other_speeds, smallest_speeds, speeds_again, speeds_on_branch
@@ -106,7 +108,8 @@ def assemble(
     given = flat_with_known(measured), held, moving, begin, t
     with compiling(all_concrete(given) and is_first(assemble, jax.tree.structure(given))):
         state, remainder = _assembled(*given)
-    state = State(state.q, state.v, mechanism.topology)  # without the joints that only measured
+    # Without the joints that only measured.
+    state = State(state.q, state.v, mechanism.topology, initial_values(mechanism.forces, state.q.dtype))
     if not all_concrete((state, remainder)):
         return _marked(mechanism, state, remainder)
     remainder = jax.tree.map(np.asarray, remainder)
@@ -143,7 +146,7 @@ def _open_speeds(mechanism, measured, speeds, t, state):
 def _marked(mechanism, state, remainder):
     """The state, with infinite speeds where it is none."""
     v = jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf)
-    return State(state.q, v, mechanism.topology)
+    return dataclasses.replace(state, v=v)
 
 
 def _assembled(*given):

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import configure
 from linkax.equations.gaps import gaps
+from linkax.equations.internal_states import bound
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.projected_state import ranks_along
@@ -71,7 +72,8 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
     leaves; it lies on a branch only if no force of the loops turns it.
     """
     q, v = method.close(system, t, state.q, state.v)
-    start, begins = State(q, v, system.topology), lax.stop_gradient(t)
+    start, begins = State(q, v, system.topology, state.internal), lax.stop_gradient(t)
+    system = bound(system, state.internal)
     # All that follows only decides, and has no derivative.
     method, system, t, given, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, state.q, q, v))
     # A singular mass matrix has spoiled them.
@@ -81,6 +83,7 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
     massive = found.definiteness > SINGULAR_ULPS * eps * len(v)
     finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & jnp.all(jnp.isfinite(found.mass))
     finite = finite & jnp.all(jnp.isfinite(jnp.where(massive, found.acceleration, 0.0)))
+    finite = finite if state.internal is None else finite & jnp.all(jnp.isfinite(state.internal))
     return InitialCheck(
         t=begins,
         state=start,

@@ -17,14 +17,15 @@ from linkax.xla.arrays import Array
 
 def _table(state: "State") -> Table:
     shape = state.q.shape[:-1]
+    internal = [] if state.internal is None else [Rows((), [("internal states", numbers(state.internal, axes=1))])]
     if state.topology is None or known(state.q) is None or known(state.v) is None:
         joints = () if state.topology is None else tuple(state.topology.coordinates)
         rows = [("q", numbers(state.q, axes=1)), ("v", numbers(state.v, axes=1)), ("joints", ", ".join(joints))]
-        return Table("State" + batch(shape), [Rows((), [row for row in rows if row[1]])])
+        return Table("State" + batch(shape), [Rows((), [row for row in rows if row[1]]), *internal])
     rows = joint_rows(state.topology, (state.q, False), (state.v, True))
     return Table(
         f"State of {count(len(rows), 'joint')} in the tree{batch(shape)}",
-        [Rows(("joint", "coordinate", "speed"), rows, "joints")],
+        [Rows(("joint", "coordinate", "speed"), rows, "joints"), *internal],
     )
 
 
@@ -34,6 +35,8 @@ class State(eqx.Module):
 
     - `q`: coordinates [rad or m], unit quaternions among them, (n_q,). `v`: speeds [rad/s or m/s], (n_v,).
     - `topology`: the plan of the mechanism, whose joints these are of; where it is None, printing tells no names.
+    - `internal`: internal states of force elements, see `linkax.AbstractForce.states`, in the order of the elements,
+      (n_s,); None where there are none, or where they have their initial values.
 
     `linkax.assemble` makes one on the closed loops from the joints' names.
     """
@@ -41,6 +44,7 @@ class State(eqx.Module):
     q: Float[Array, "*batch n_q"]
     v: Float[Array, "*batch n_v"]
     topology: Topology | None = eqx.field(static=True, default=None, repr=False)
+    internal: Float[Array, "*batch n_s"] | None = None
 
     @staticmethod
     def as_drawn(mechanism: Mechanism) -> "State":

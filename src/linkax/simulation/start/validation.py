@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from linkax.model.functions import Law
+from linkax.model.internal_states import initial_values
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, Vector, is_finite, namespace, number, real, require, require_type
 from linkax.model.poses import Pose, Velocity
@@ -116,7 +117,20 @@ def checked_state(mechanism: Mechanism, state: State) -> State:
             require(entries[taken], is_finite, of_joint, "it must be finite")
             if kind.has_quaternion and what == "q":
                 _check_quaternion(entries[taken], of_joint)
-    return State(found[0], found[1], topology)
+    return State(found[0], found[1], topology, _checked_internal(mechanism, state.internal, found[0].dtype))
+
+
+def _checked_internal(mechanism, given, dtype):
+    """Internal states of a mechanism, by default their initial values; None where it has none."""
+    initial = initial_values(mechanism.forces, dtype)
+    if given is None or initial is None:
+        if given is not None:
+            raise ValueError(
+                f"state.internal is {given!r}, and no force element of this mechanism has internal states; give None"
+            )
+        return initial
+    what = "state.internal"
+    return require(number(given, initial.shape, what), is_finite, what, "it must be finite").astype(dtype)
 
 
 def _check_quaternion(coordinates, what):
