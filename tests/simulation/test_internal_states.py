@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import linkax as lx
 
@@ -196,6 +197,34 @@ def test_single_precision():
     solution = turned(pendulum(Motor()), dtype=jnp.float32, accuracy=lx.DRAFT)
     assert solution.internal.dtype == jnp.float32
     assert solution.result == lx.RESULTS.successful
+
+
+class Learned(lx.AbstractForce):
+    """A torque by a network, whose activation is a function among its leaves."""
+
+    network: eqx.nn.MLP
+
+    @property
+    def terms(self):
+        return (PIN,)
+
+    def load(self, t, motion):
+        seen = jnp.stack([motion.joint("pin"), motion.joint_speed("pin")])
+        return motion.joint_load(PIN, self.network(seen))
+
+
+@pytest.mark.slow
+def test_a_network_may_be_a_force():
+    network = eqx.nn.MLP(2, "scalar", 4, 1, jnp.tanh, key=jax.random.key(0))
+    weights, function = eqx.partition(network, eqx.is_array)
+    flat, restored = ravel_pytree(weights)
+
+    def end(flat):
+        return turned(pendulum(Learned(eqx.combine(restored(flat), function))), accuracy=lx.PRECISE).end.q[0]
+
+    along = jnp.cos(jnp.arange(len(flat)))
+    central = (end(flat + 1e-5 * along) - end(flat - 1e-5 * along)) / 2e-5
+    np.testing.assert_allclose(jax.grad(end)(flat) @ along, central, rtol=1e-6)
 
 
 class WithoutRates(lx.AbstractForce):

@@ -21,6 +21,7 @@ from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.integrate.switches import Sides, crossed, meet
 from linkax.xla.arrays import Array
+from linkax.xla.tracing import without_derivatives
 
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
 STAGNATES = 0.9  # rate at which they no longer fall
@@ -224,7 +225,8 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         switch = None
         if switching:
             within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
-            switch, sides = lax.stop_gradient(meet(*lax.stop_gradient((args, t0, t1, y0, y1)), within))
+            fixed = without_derivatives((args, t0, t1, y0, y1))
+            switch, sides = lax.stop_gradient(meet(*fixed, within=within))
             y1 = args.on_sides(y1, sides) if self.is_undifferentiated else crossed(args, t1, y1, sides)
         state = SolverState(inner, arrives, closest)
         return y1, StepError(errors, leaves, passes, retry, switch), dense_info, state, result

@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, on_manifold
@@ -165,12 +164,12 @@ def _assemble(flat, positions, speeds, guess, t, *, branches):
     demand, begin = demand_of(flat, positions, guess, t)
     if (rough := guess.of_cuts()).groups:
         given = given_in_tree(demand.system.topology, guess, positions)
-        begin = rough_start(*lax.stop_gradient((demand, rough, begin)), given)
+        begin = rough_start(*without_derivatives((demand, rough, begin)), given)
     q = close_loops(demand, begin, None)
     system, configuration = demand.system, configure(demand.system, t, q)
     found = (speeds_on_branch if branches else smallest_speeds)(configuration, speeds)
     # All else only decides, and has no derivative.
-    demand, begin, end, configuration = jax.tree.map(lax.stop_gradient, (demand, begin, q, configuration))
+    demand, begin, end, configuration = without_derivatives((demand, begin, q, configuration))
     off, gap = jnp.abs(demand.back(end, begin)), gaps(configuration)
     remainder = Remainder(
         gap=gap,

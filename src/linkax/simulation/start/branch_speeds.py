@@ -26,6 +26,7 @@ from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import materialise, positive_or_one, pushforward, ratio
 from linkax.xla.program import Program
+from linkax.xla.tracing import without_derivatives
 
 TURNS = 30  # of Newton's method: from close to where y² = x² is flat, each but halves the way
 BESIDE = 1e-2
@@ -172,7 +173,7 @@ def speeds_again(configuration: Configuration, held: JointValues, branches: bool
 
 def _found(asked, held, least, v, off_branch, undecided):
     given = asked.scale * v
-    asked, least, v, off_branch = lax.stop_gradient((asked, least, v, off_branch))
+    asked, least, v, off_branch = without_derivatives((asked, least, v, off_branch))
     # What the loops leave of them: a row that is nearly none opens little, and yet may allow no motion at all.
     split, scale = asked.split, asked.scale
     opened = split.jacobian @ least - asked.right[: split.jacobian.shape[0]]

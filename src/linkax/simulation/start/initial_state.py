@@ -20,6 +20,7 @@ from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
 from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
+from linkax.xla.tracing import without_derivatives
 
 MOVES = 1e-6  # of the largest speed
 SINGULAR_ULPS = 8.0  # times the number of speeds: what rounding leaves of a singular mass matrix
@@ -75,7 +76,7 @@ def check_initial_state(method: TangentSpace, system: System, t: Float[Array, ""
     start, begins = State(q, v, system.topology, state.internal), lax.stop_gradient(t)
     system = bound(system, state.internal)
     # All that follows only decides, and has no derivative.
-    method, system, t, given, q, v = jax.tree.map(lax.stop_gradient, (method, system, t, state.q, q, v))
+    method, system, t, given, q, v = without_derivatives((method, system, t, state.q, q, v))
     # A singular mass matrix has spoiled them.
     q, v = jnp.where(jnp.all(jnp.isfinite(q)), q, given), jnp.where(jnp.isfinite(v), v, 0.0)
     found = _at_start(method, system, t, q, v)
