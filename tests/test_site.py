@@ -20,7 +20,16 @@ DESCRIBED = {page: [*LISTS[page].split(), *BY_HAND[page]] for page in TEXTS}
 # Minutes of compiling.
 SLOW = tuple(
     f"reference/{page}"
-    for page in ("derivatives", "kinematics", "synthesis", "laboratory", "tolerances", "formulations", "beams")
+    for page in (
+        "derivatives",
+        "kinematics",
+        "synthesis",
+        "laboratory",
+        "tolerances",
+        "formulations",
+        "beams",
+        "internal_states",
+    )
 )
 mark = lambda page: [pytest.mark.slow] if page in SLOW else []
 

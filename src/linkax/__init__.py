@@ -46,6 +46,9 @@ from linkax.formulations.moore_penrose import MoorePenrose as MoorePenrose  # no
 from linkax.formulations.projection_operator import ProjectionOperator as ProjectionOperator  # noqa: E402
 from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402
 from linkax.linalg.pivoted_qr import pivoted_qr as pivoted_qr  # noqa: E402
+from linkax.model.actuators import DCMotor as DCMotor  # noqa: E402
+from linkax.model.actuators import HydraulicCylinder as HydraulicCylinder  # noqa: E402
+from linkax.model.actuators import PneumaticSpring as PneumaticSpring  # noqa: E402
 from linkax.model.attached import Attached as Attached  # noqa: E402
 from linkax.model.attached import Moving as Moving  # noqa: E402
 from linkax.model.beams import Beam as Beam  # noqa: E402
@@ -57,6 +60,8 @@ from linkax.model.bodies import point_mass as point_mass  # noqa: E402
 from linkax.model.constraints import AbstractConstraint as AbstractConstraint  # noqa: E402
 from linkax.model.constraints import Coupling as Coupling  # noqa: E402
 from linkax.model.constraints import Drive as Drive  # noqa: E402
+from linkax.model.controllers import FirstOrderSensor as FirstOrderSensor  # noqa: E402
+from linkax.model.controllers import PIDController as PIDController  # noqa: E402
 from linkax.model.curves import PeriodicSpline as PeriodicSpline  # noqa: E402
 from linkax.model.curves import SplineCurve as SplineCurve  # noqa: E402
 from linkax.model.forces import AbstractForce as AbstractForce  # noqa: E402
@@ -95,6 +100,8 @@ from linkax.model.point_forces import PointMoment as PointMoment  # noqa: E402
 from linkax.model.point_forces import Spring as Spring  # noqa: E402
 from linkax.model.poses import Pose as Pose  # noqa: E402
 from linkax.model.poses import Velocity as Velocity  # noqa: E402
+from linkax.model.rate_dependent import LuGreFriction as LuGreFriction  # noqa: E402
+from linkax.model.rate_dependent import MaxwellElement as MaxwellElement  # noqa: E402
 from linkax.model.rods import rod as rod  # noqa: E402
 from linkax.model.rods import rod_between as rod_between  # noqa: E402
 from linkax.model.rolling import RollingDisc as RollingDisc  # noqa: E402
@@ -107,6 +114,8 @@ from linkax.model.sections import Section as Section  # noqa: E402
 from linkax.model.sections import circle as circle  # noqa: E402
 from linkax.model.sections import rectangle as rectangle  # noqa: E402
 from linkax.model.terms import Term as Term  # noqa: E402
+from linkax.model.time_laws import PiecewiseLinear as PiecewiseLinear  # noqa: E402
+from linkax.model.time_laws import Spline as Spline  # noqa: E402
 from linkax.simulation.integrate.accuracy import BALANCED as BALANCED  # noqa: E402
 from linkax.simulation.integrate.accuracy import DRAFT as DRAFT  # noqa: E402
 from linkax.simulation.integrate.accuracy import PRECISE as PRECISE  # noqa: E402

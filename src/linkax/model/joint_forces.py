@@ -16,7 +16,7 @@ from linkax.model.terms import Term, TermLike, term
 from linkax.xla.arrays import Scalar
 
 
-class _AlongJoint(AbstractForce):
+class AlongJoint(AbstractForce):
     """A torque, or a force on a slide, along one speed of a joint; its opposite acts on the parent."""
 
     name: str | None = eqx.field(static=True)
@@ -27,14 +27,14 @@ class _AlongJoint(AbstractForce):
         return (self.joint,)
 
     @abc.abstractmethod
-    def strength(self, t: Number, motion: Motion) -> Scalar:
+    def strength(self, t: Number, motion: Motion, *args: Any) -> Scalar:
         """Compute the torque or force along the joint, on the child [N m or N]."""
 
-    def load(self, t: Number, motion: Motion) -> Load:
-        return motion.joint_load(self.joint, self.strength(t, motion))
+    def load(self, t: Number, motion: Motion, *args: Any) -> Load:
+        return motion.joint_load(self.joint, self.strength(t, motion, *args))
 
 
-class JointTorque(_AlongJoint):
+class JointTorque(AlongJoint):
     """A torque [N m], or a force [N] on a slide, along a joint, on the child; its opposite acts on the parent.
 
     **Arguments:**
@@ -58,7 +58,7 @@ class JointTorque(_AlongJoint):
         return evaluated(self.torque, t, motion)
 
 
-class JointSpring(_AlongJoint):
+class JointSpring(AlongJoint):
     """A linear spring along a joint: −stiffness × (coordinate − free).
 
     At a cut joint (where all joints of a loop have springs, say) the angle from `free` is taken in (−π, π]: the
@@ -92,7 +92,7 @@ class JointSpring(_AlongJoint):
         return self.stiffness * configuration.joint_displacement(self.joint, self.free) ** 2 / 2.0
 
 
-class JointDamper(_AlongJoint):
+class JointDamper(AlongJoint):
     """Viscous damping along a joint: −damping × speed.
 
     **Arguments:** `joint`: a name, or (name, index); `damping` [N m s/rad or N s/m]; `name`, see
@@ -110,7 +110,7 @@ class JointDamper(_AlongJoint):
         return -self.damping * motion.joint_rate(self.joint)
 
 
-class JointFriction(_AlongJoint):
+class JointFriction(AlongJoint):
     """Coulomb friction along a joint, regularised: −torque × tanh(speed / scale).
 
     Below `scale` it is nearly viscous, so a joint at rest under a load creeps; at 3 × scale it has 99.5 % of

@@ -22,7 +22,7 @@ from linkax.xla.derivatives import ratio
 Axes = Literal["ground", "frame"]
 
 
-class _BetweenPoints(AbstractForce):
+class BetweenPoints(AbstractForce):
     """A force along the line between the origins of two frames."""
 
     name: str | None = eqx.field(static=True)
@@ -37,11 +37,20 @@ class _BetweenPoints(AbstractForce):
         return length(configuration.between(self.first, self.second))
 
     @abc.abstractmethod
-    def pull(self, motion: Motion) -> Float[Array, "3"]:
-        """Compute the force on the first point [N]; its opposite acts on the second."""
+    def strength(self, t: Number, motion: Motion, *args: Any) -> Scalar:
+        """Compute the pull [N], negative where it pushes."""
 
-    def load(self, t: Number, motion: Motion) -> Load:
-        force = self.pull(motion)
+    def pull(self, t: Number, motion: Motion, *args: Any) -> Float[Array, "3"]:
+        """Compute the force on the first point [N]; its opposite acts on the second."""
+        return self.strength(t, motion, *args) * _unit(motion.configuration.between(self.first, self.second))
+
+    def distance_rate(self, motion: Motion) -> Scalar:
+        """Compute the rate of the distance [m/s]."""
+        velocity = motion.point_velocity(self.second) - motion.point_velocity(self.first)
+        return dot(velocity, _unit(motion.configuration.between(self.first, self.second)))
+
+    def load(self, t: Number, motion: Motion, *args: Any) -> Load:
+        force = self.pull(t, motion, *args)
         return motion.point_load(self.first, force).plus(motion.point_load(self.second, -force))
 
 
@@ -50,7 +59,7 @@ def _unit(vector: Float[Array, "3"]) -> Float[jax.Array, "3"]:
     return ratio(vector, length(vector), 0.0)
 
 
-class Spring(_BetweenPoints):
+class Spring(BetweenPoints):
     """A linear spring between two points, with the pull stiffness × (distance − free_length).
 
     Where the points meet there is no direction, and it does not push.
@@ -73,7 +82,7 @@ class Spring(_BetweenPoints):
         name: str | None = None,
     ) -> None:
         self.name = optional_name(name, "Spring")
-        self.first, self.second = _frames("Spring", first, second)
+        self.first, self.second = two_points("Spring", first, second)
         self.stiffness = number(stiffness, (), f"{self.display_name}: stiffness [N/m]")
         self.free_length = zero_or_more(free_length, f"{self.display_name}: free_length [m]")
 
@@ -84,7 +93,7 @@ class Spring(_BetweenPoints):
     def strength(self, t: Number, motion: Motion) -> Scalar:
         return self.stiffness * (self.extent(motion.configuration) - self.free_length)
 
-    def pull(self, motion: Motion) -> Float[Array, "3"]:
+    def pull(self, t: Number, motion: Motion) -> Float[Array, "3"]:
         along = motion.configuration.between(self.first, self.second)
         return self.stiffness * (along - self.free_length * _unit(along))
 
@@ -94,7 +103,7 @@ class Spring(_BetweenPoints):
         return self.stiffness * stretch**2 / 2.0
 
 
-class Damper(_BetweenPoints):
+class Damper(BetweenPoints):
     """Viscous damping between two points, with the pull damping × rate of their distance.
 
     **Arguments:** `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`; `damping` [N s/m];
@@ -105,20 +114,11 @@ class Damper(_BetweenPoints):
 
     def __init__(self, first: BodyOrFrame, second: BodyOrFrame, damping: Number, *, name: str | None = None) -> None:
         self.name = optional_name(name, "Damper")
-        self.first, self.second = _frames("Damper", first, second)
+        self.first, self.second = two_points("Damper", first, second)
         self.damping = number(damping, (), f"{self.display_name}: damping [N s/m]")
 
     def strength(self, t: Number, motion: Motion) -> Scalar:
-        return self.damping * self._rate(motion)[0]
-
-    def pull(self, motion: Motion) -> Float[Array, "3"]:
-        rate, direction = self._rate(motion)
-        return self.damping * rate * direction
-
-    def _rate(self, motion):
-        """Of the distance, and the direction along which it is."""
-        direction = _unit(motion.configuration.between(self.first, self.second))
-        return dot(motion.point_velocity(self.second) - motion.point_velocity(self.first), direction), direction
+        return self.damping * self.distance_rate(motion)
 
 
 class _OnPoint(AbstractForce):
@@ -206,7 +206,8 @@ class PointMoment(_OnPoint):
         return motion.point_load(self.point, nothing, self.strength(t, motion))
 
 
-def _frames(kind: str, first: BodyOrFrame, second: BodyOrFrame) -> tuple[Frame, Frame]:
+def two_points(kind: str, first: BodyOrFrame, second: BodyOrFrame) -> tuple[Frame, Frame]:
+    """Check the points of a force between two bodies."""
     ends = frame_of(first, f"{kind}: first point"), frame_of(second, f"{kind}: second point")
     if ends[0].body == ends[1].body:
         raise ValueError(f"{described(kind, named(ends[:1]))}: both points are on it; give points on two bodies")

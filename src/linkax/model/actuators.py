@@ -1,0 +1,304 @@
+"""Actuators with internal states: motors, hydraulic cylinders, gas springs."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+
+from linkax.model.bodies import BodyOrFrame
+from linkax.model.elements import Configuration, Motion
+from linkax.model.functions import Law, evaluated, number_or_law
+from linkax.model.internal_states import InternalState, States
+from linkax.model.joint_forces import AlongJoint
+from linkax.model.names import optional_name
+from linkax.model.numbers import Number, number, positive, require, zero_or_more
+from linkax.model.point_forces import BetweenPoints, two_points
+from linkax.model.terms import TermLike, term
+from linkax.xla.arrays import Scalar
+
+Control = Number | Callable[[Any, Any], Number]  # what an actuator is asked for: a number, or a law (t, motion)
+
+
+class DCMotor(AlongJoint):
+    """A direct-current motor along a joint: L di/dt = u − R i − k ω, with the torque k i on the child.
+
+    Its state is "current" [A].
+
+    **Arguments:**
+
+    - `joint`: a name, or (name, index).
+    - `voltage`: u [V], a number, or a function (t, motion) ↦ number; see `linkax.JointTorque`.
+    - `resistance`: R [Ω]. `inductance`: L [H]. `constant`: k [N m/A, or N/A on a slide], the torque of one ampere and
+      the voltage of one rad/s; of a motor with a gear, times the gear's ratio.
+    - `current`: at the start [A]. `scale`: a typical current [A], see `linkax.InternalState`.
+    - `name`: see `linkax.AbstractForce`.
+
+    **Raises:** `ValueError` for an inductance or a scale that is not positive, and for a negative resistance.
+    """
+
+    voltage: Scalar | Law
+    resistance: Scalar
+    inductance: Scalar
+    constant: Scalar
+    current: Scalar
+    scale: Scalar
+
+    def __init__(
+        self,
+        joint: TermLike,
+        voltage: Control,
+        *,
+        resistance: Number,
+        inductance: Number,
+        constant: Number,
+        current: Number = 0.0,
+        scale: Number = 1.0,
+        name: str | None = None,
+    ) -> None:
+        self.name = optional_name(name, "DCMotor")
+        self.joint = term(joint, "DCMotor")
+        self.voltage = number_or_law(voltage, (), f"{self.display_name}: voltage [V]")
+        self.resistance = zero_or_more(resistance, f"{self.display_name}: resistance [Ω]")
+        self.inductance = positive(inductance, f"{self.display_name}: inductance [H]")
+        self.constant = number(constant, (), f"{self.display_name}: constant [N m/A]")
+        self.current = number(current, (), f"{self.display_name}: current [A]")
+        self.scale = positive(scale, f"{self.display_name}: scale [A]")
+
+    @property
+    def states(self) -> Mapping[str, InternalState]:
+        return {"current": InternalState(self.current, "A", scale=self.scale)}
+
+    def rates(self, t: Number, motion: Motion, states: States) -> States:
+        induced = self.constant * motion.joint_rate(self.joint)
+        driving = evaluated(self.voltage, t, motion) - self.resistance * states["current"] - induced
+        return {"current": driving / self.inductance}
+
+    def strength(self, t: Number, motion: Motion, states: States) -> Scalar:
+        return self.constant * states["current"]
+
+
+class HydraulicCylinder(BetweenPoints):
+    """A double-acting hydraulic cylinder between two points, fed through a proportional valve.
+
+    Chamber A pushes the points apart, chamber B, on the side of the rod, pulls them together; x is the distance of the
+    points less `closed`, and p the pressure of a chamber:
+
+    - V_A = V₀ + A_A x, V_B = V₀ + A_B (stroke − x), pull p_B A_B − p_A A_A + damping × ẋ.
+    - V_A ṗ_A = β (Q_A − A_A ẋ − c (p_A − p_B)), V_B ṗ_B = β (Q_B + A_B ẋ + c (p_A − p_B)).
+    - At an opening u > 0, Q_A = K u √(p_S − p_A) and Q_B = −K u √(p_B − p_T); at u < 0 supply and tank are exchanged.
+      Roots are rounded within `laminar` of zero, where the flow turns.
+
+    Its states are "a" and "b", the pressures of the chambers [Pa]. As u passes zero, flows have a kink. Jelali and
+    Kroll, Hydraulic Servo-systems (2003), ch. 4.
+
+    **Arguments:**
+
+    - `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
+    - `opening`: of the valve, u from −1 to 1, a number, or a function (t, motion) ↦ number; see `linkax.JointTorque`.
+    - `areas`: (A_A, A_B) [m²]. `closed`: the distance of the points at x = 0 [m]; `stroke`: the largest x [m].
+    - `valve`: K [m³/s/√Pa], the flow at u = 1 over the root of the pressure drop. `supply`, `tank`: p_S, p_T [Pa].
+    - `bulk_modulus`: β [Pa]. `dead_volume`: V₀ of each chamber with its lines [m³]. `leakage`: c [m³/s/Pa].
+    - `damping`: of the seals [N s/m]. `laminar` [Pa].
+    - `pressures`: (p_A, p_B) at the start [Pa]; by default that of the tank.
+    - `name`: see `linkax.AbstractForce`.
+
+    The piston may leave the stroke: nothing stops it, and beyond the dead volume no state is finite. Pressures may fall
+    below zero, as oil without cavitation would.
+
+    **Raises:** `ValueError` for a number outside of what it can be.
+    """
+
+    opening: Scalar | Law
+    area_a: Scalar
+    area_b: Scalar
+    closed: Scalar
+    stroke: Scalar
+    valve: Scalar
+    supply: Scalar
+    tank: Scalar
+    bulk_modulus: Scalar
+    dead_volume: Scalar
+    leakage: Scalar
+    damping: Scalar
+    laminar: Scalar
+    pressure_a: Scalar
+    pressure_b: Scalar
+
+    def __init__(
+        self,
+        first: BodyOrFrame,
+        second: BodyOrFrame,
+        opening: Control,
+        *,
+        areas: tuple[Number, Number],
+        closed: Number,
+        stroke: Number,
+        valve: Number,
+        supply: Number,
+        tank: Number = 0.0,
+        bulk_modulus: Number = 1.4e9,
+        dead_volume: Number,
+        leakage: Number = 0.0,
+        damping: Number = 0.0,
+        laminar: Number = 1e4,
+        pressures: tuple[Number, Number] | None = None,
+        name: str | None = None,
+    ) -> None:
+        self.name = optional_name(name, "HydraulicCylinder")
+        self.first, self.second = two_points("HydraulicCylinder", first, second)
+        of = f"{self.display_name}:"
+        self.opening = number_or_law(opening, (), f"{of} opening")
+        both = require(number(areas, (2,), f"{of} areas [m²]"), lambda x: (x > 0.0).all(), f"{of} areas [m²]", POSITIVE)
+        self.area_a, self.area_b = both[0], both[1]
+        self.closed = zero_or_more(closed, f"{of} closed [m]")
+        self.stroke = positive(stroke, f"{of} stroke [m]")
+        self.valve = zero_or_more(valve, f"{of} valve [m³/s/√Pa]")
+        self.tank = number(tank, (), f"{of} tank [Pa]")
+        self.supply = positive(supply, f"{of} supply [Pa]")
+        self.bulk_modulus = positive(bulk_modulus, f"{of} bulk_modulus [Pa]")
+        self.dead_volume = positive(dead_volume, f"{of} dead_volume [m³]")
+        self.leakage = zero_or_more(leakage, f"{of} leakage [m³/s/Pa]")
+        self.damping = zero_or_more(damping, f"{of} damping [N s/m]")
+        self.laminar = positive(laminar, f"{of} laminar [Pa]")
+        begin = (self.tank, self.tank) if pressures is None else number(pressures, (2,), f"{of} pressures [Pa]")
+        self.pressure_a, self.pressure_b = begin[0], begin[1]
+
+    @property
+    def states(self) -> Mapping[str, InternalState]:
+        begin = {"a": self.pressure_a, "b": self.pressure_b}
+        return {name: InternalState(pressure, "Pa", scale=self.supply) for name, pressure in begin.items()}
+
+    def volumes(self, configuration: Configuration) -> dict[str, Scalar]:
+        """Compute the volumes of the chambers with their lines, "a" and "b" [m³]."""
+        x = self.extent(configuration) - self.closed
+        return {
+            "a": self.dead_volume + self.area_a * x,
+            "b": self.dead_volume + self.area_b * (self.stroke - x),
+        }
+
+    def flows(self, t: Number, motion: Motion, states: States) -> dict[str, Scalar]:
+        """Compute the oil that flows into each chamber through the valve, "a" and "b", and from "a" to "b" past the
+        piston, "leakage" [m³/s].
+        """
+        opening = evaluated(self.opening, t, motion)
+        onward, back = jnp.maximum(opening, 0.0), jnp.maximum(-opening, 0.0)
+
+        def through(open_to_supply, open_to_tank, pressure):
+            filled, drained = self._root(self.supply - pressure), self._root(pressure - self.tank)
+            return self.valve * (open_to_supply * filled - open_to_tank * drained)
+
+        return {
+            "a": through(onward, back, states["a"]),
+            "b": through(back, onward, states["b"]),
+            "leakage": self.leakage * (states["a"] - states["b"]),
+        }
+
+    def _root(self, drop):
+        """The root of a pressure drop with its sign, linear near zero."""
+        return drop / (drop**2 + self.laminar**2) ** 0.25
+
+    def rates(self, t: Number, motion: Motion, states: States) -> States:
+        flows, volumes = self.flows(t, motion, states), self.volumes(motion.configuration)
+        speed = self.distance_rate(motion)
+        gain = {
+            "a": flows["a"] - flows["leakage"] - self.area_a * speed,
+            "b": flows["b"] + flows["leakage"] + self.area_b * speed,
+        }
+        return {name: self.bulk_modulus * gain[name] / volumes[name] for name in gain}
+
+    def strength(self, t: Number, motion: Motion, states: States) -> Scalar:
+        return states["b"] * self.area_b - states["a"] * self.area_a + self.damping * self.distance_rate(motion)
+
+
+class PneumaticSpring(BetweenPoints):
+    """Gas in a cylinder that pushes two points apart: p = p₀ (μ V₀ / V)ⁿ, with V = A × (distance − closed).
+
+    n is one for a gas that keeps its temperature, the ratio of its heat capacities (1.4 for air) for one that exchanges
+    no heat. V₀ is the volume at `free_length`, where a sealed spring has the pressure p₀. The pull is −(p − ambient) A.
+
+    Sealed, the spring conserves energy and has no state. With a `flow`, its state "amount" is μ, the gas over what it
+    holds at the start.
+
+    **Arguments:**
+
+    - `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
+    - `area`: A [m²]. `closed`: the distance at which no volume is left [m]. `free_length` [m], larger than `closed`.
+    - `pressure`: p₀ [Pa], absolute. `ambient` [Pa]. `exponent`: n.
+    - `flow`: rate of μ [1/s], a number, or a function (t, motion) ↦ number; None for a sealed spring.
+    - `name`: see `linkax.AbstractForce`.
+
+    **Raises:** `ValueError` for a number outside of what it can be.
+    """
+
+    area: Scalar
+    closed: Scalar
+    free_length: Scalar
+    pressure: Scalar
+    ambient: Scalar
+    exponent: Scalar
+    flow: Scalar | Law | None
+
+    def __init__(
+        self,
+        first: BodyOrFrame,
+        second: BodyOrFrame,
+        *,
+        area: Number,
+        free_length: Number,
+        pressure: Number,
+        closed: Number = 0.0,
+        ambient: Number = 101325.0,
+        exponent: Number = 1.4,
+        flow: Control | None = None,
+        name: str | None = None,
+    ) -> None:
+        self.name = optional_name(name, "PneumaticSpring")
+        self.first, self.second = two_points("PneumaticSpring", first, second)
+        of = f"{self.display_name}:"
+        self.area = positive(area, f"{of} area [m²]")
+        self.closed = zero_or_more(closed, f"{of} closed [m]")
+        beyond, what = (lambda length: length > self.closed), f"{of} free_length [m]"
+        self.free_length = require(number(free_length, (), what), beyond, what, "it must be larger than closed")
+        self.pressure = positive(pressure, f"{of} pressure [Pa]")
+        self.ambient = zero_or_more(ambient, f"{of} ambient [Pa]")
+        self.exponent = positive(exponent, f"{of} exponent")
+        self.flow = None if flow is None else number_or_law(flow, (), f"{of} flow [1/s]")
+
+    @property
+    def states(self) -> Mapping[str, InternalState]:
+        return {} if self.flow is None else {"amount": InternalState(1.0)}
+
+    def rates(self, t: Number, motion: Motion, states: States) -> States:
+        assert self.flow is not None
+        return {"amount": jnp.asarray(evaluated(self.flow, t, motion), motion.system.dtype)}
+
+    @property
+    def conserves_energy(self) -> bool:
+        return self.flow is None
+
+    def strength(self, t: Number, motion: Motion, *args: Any) -> Scalar:
+        amount = args[0]["amount"] if args else 1.0
+        pressure = self.pressure * (amount * self._compression(motion.configuration)) ** self.exponent
+        return -(pressure - self.ambient) * self.area
+
+    def potential_energy(self, configuration: Configuration, *args: Any) -> Scalar:
+        if args:
+            return super().potential_energy(configuration, *args)
+        logarithm = jnp.log(self._compression(configuration))
+        x = (self.exponent - 1.0) * logarithm
+        near = jnp.abs(x) < SMALL
+        growth = jnp.where(near, 1.0 + x / 2.0, jnp.expm1(x) / jnp.where(near, 1.0, x))
+        expansion = self.area * (self.extent(configuration) - self.free_length)
+        return self.pressure * self._free_volume * logarithm * growth + self.ambient * expansion
+
+    @property
+    def _free_volume(self):
+        return self.area * (self.free_length - self.closed)
+
+    def _compression(self, configuration):
+        """V₀ / V."""
+        return (self.free_length - self.closed) / (self.extent(configuration) - self.closed)
+
+
+POSITIVE = "they must be positive"
+SMALL = 1e-8  # up to which a series of two terms is exact to rounding
