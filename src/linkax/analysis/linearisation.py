@@ -46,6 +46,18 @@ def _table(found: "Linearisation") -> Table:
     return Table(title, [Rows(("mode", "natural frequency", ""), rows, "modes")])
 
 
+class StateSlopes(NamedTuple):
+    """Small changes σ of the internal states of force elements: ÿ + D ẏ + K y = B σ, σ̇ = G y + H ẏ + S σ.
+
+    - `force`: B, (d, n_s). `by_coordinates`: G, (n_s, d). `by_speeds`: H, (n_s, d). `by_states`: S, (n_s, n_s) [1/s].
+    """
+
+    force: Float[Array, "d n_s"]
+    by_coordinates: Float[Array, "n_s d"]
+    by_speeds: Float[Array, "n_s d"]
+    by_states: Float[Array, "n_s n_s"]
+
+
 @printed_as(_table)
 class Linearisation(NamedTuple):
     """Small motions about a state, v = T ẏ on the tangent space: ÿ + D ẏ + K y = 0.
@@ -57,6 +69,9 @@ class Linearisation(NamedTuple):
     - `modes`: speeds of the tree's joints in each mode, (n_v, d), scaled to vᵀ M v = 1. NaN where gyroscopic terms
       leave no modes in which all joints move in phase; see `eigenvectors` then.
     - `basis`: T, (n_v, d), with Tᵀ M T = 1. `stiffness`: K, (d, d) [1/s²]. `damping`: D, (d, d) [1/s].
+    - `states`: what internal states of force elements add, in the order of `State.internal`: their `force` B, (d, n_s),
+      and their rates G y + H ẏ + S σ, `by_coordinates`, `by_speeds` and `by_states`; None without any. All of the above
+      holds them constant; `eigenvalues` does not, so that |λ| has the natural frequency of a hydraulic cylinder.
 
     About a steady motion, y are changes of the joints' coordinates that move with it, and frequencies are those seen
     from the rotating bodies: a rotor that whirls at ω seen from the ground whirls at ω − Ω here. Centrifugal forces,
@@ -71,30 +86,40 @@ class Linearisation(NamedTuple):
     basis: Float[Array, "n_v d"]
     stiffness: Float[Array, "d d"]
     damping: Float[Array, "d d"]
+    states: StateSlopes | None = None
 
     @property
     def eigenvalues(self) -> Complex[Array, "*batch n"]:
-        """λ of the motions exp(λ t), with damping and gyroscopic terms, (2 d,) [1/s]. A motion grows where Re λ > 0."""
-        return _of_members(self.stiffness, self.damping)[0]
+        """λ of the motions exp(λ t), with damping, gyroscopic terms and internal states, (2 d + n_s,) [1/s].
+
+        A motion grows where Re λ > 0.
+        """
+        return _of_members(self.stiffness, self.damping, self.states)[0]
 
     @property
     def eigenvectors(self) -> Complex[Array, "*batch n_v n"]:
-        """Speeds of the tree's joints in the motion of each of `eigenvalues`, (n_v, 2 d), scaled arbitrarily."""
+        """Speeds of the tree's joints in the motion of each of `eigenvalues`, (n_v, 2 d + n_s), scaled arbitrarily."""
         count = self.stiffness.shape[-1]
-        return self.basis @ _of_members(self.stiffness, self.damping)[1][..., count:, :]
+        return self.basis @ _of_members(self.stiffness, self.damping, self.states)[1][..., count : 2 * count, :]
 
 
-def state_matrix(stiffness: Float[Array, "d d"], damping: Float[Array, "d d"]) -> Float[Array, "2*d 2*d"]:
-    """A in d/dt (y, ẏ) = A (y, ẏ)."""
+def state_matrix(
+    stiffness: Float[Array, "*batch d d"], damping: Float[Array, "*batch d d"], states: StateSlopes | None = None
+) -> Float[Array, "*batch n n"]:
+    """A in d/dt (y, ẏ, σ) = A (y, ẏ, σ)."""
     nothing = jnp.zeros_like(stiffness)
-    return jnp.block([[nothing, nothing + jnp.eye(len(nothing))], [-stiffness, -damping]])
+    rows = [[nothing, nothing + jnp.eye(nothing.shape[-1])], [-stiffness, -damping]]
+    if states is not None:
+        rows[0].append(jnp.zeros_like(states.force))
+        rows[1].append(states.force)
+        rows.append([states.by_coordinates, states.by_speeds, states.by_states])
+    return jnp.block(rows)
 
 
 @jax.jit
-def _of_members(stiffness, damping):
+def _of_members(stiffness, damping, states):
     """Eigenvalues and eigenvectors of the state matrix of each member of a batch."""
-    of_one = lambda stiffness, damping: _spectrum(state_matrix(stiffness, damping))
-    return jnp.vectorize(of_one, signature="(n,n),(n,n)->(m),(m,m)")(stiffness, damping)
+    return jnp.vectorize(_spectrum, signature="(n,n)->(n),(n,n)")(state_matrix(stiffness, damping, states))
 
 
 def gyroscopic_frequencies(matrix: Float[Array, "n n"]) -> Float[Array, " n//2"]:

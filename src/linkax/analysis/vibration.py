@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import ArrayLike, Bool, Float
 
-from linkax.analysis.linearisation import Linearisation, gyroscopic_frequencies, state_matrix
+from linkax.analysis.linearisation import Linearisation, StateSlopes, gyroscopic_frequencies, state_matrix
 from linkax.analysis.steady import (
     AGREES,
     Nearby,
@@ -24,13 +24,14 @@ from linkax.analysis.steady import (
 )
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import carried, retract
+from linkax.equations.internal_states import bound, internal_rates
 from linkax.equations.loops import jacobian
 from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
-from linkax.model.internal_states import refuse_states
+from linkax.model.internal_states import scales
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import whole_number
 from linkax.simulation.explain.diagnosis import massless_bodies
@@ -113,17 +114,21 @@ class _Steadiness(NamedTuple):
     - `missed`: by how much speeds miss the rates that loops and drives ask for, (m,).
     - `off`: distance from an equilibrium [rad, lengths of the mechanism]. `acceleration`: of the tree's joints, (n_v,).
     - `changes`: relative change of coefficients and loops as the motion goes on.
+    - `of_states`: how far internal states are off where they stand still, (n_s,), or other coordinates by which they
+      would [scales of the states, rad, lengths of the mechanism].
     """
 
     missed: Float[Array, " m"]
     off: Float[Array, ""]
     acceleration: Float[Array, " n_v"]
     changes: Float[Array, ""]
+    of_states: Float[Array, " n_s"]
 
     @property
     def is_steady(self) -> Bool[Array, ""]:
         """Whether all of them are negligible."""
-        return (jnp.max(self.missed, initial=0.0) <= AGREES) & (self.off <= NEAR) & (self.changes <= CONSTANT)
+        still = jnp.max(self.of_states, initial=0.0) <= NEAR
+        return (jnp.max(self.missed, initial=0.0) <= AGREES) & (self.off <= NEAR) & (self.changes <= CONSTANT) & still
 
 
 def linearise(
@@ -142,12 +147,13 @@ def linearise(
 
     **Returns:** a `Linearisation`.
 
-    **Raises:** `ValueError` for a state that is neither in equilibrium nor in steady motion, and for a force element
-    with internal states. Inside JAX transformations
+    Internal states of force elements, such as pressures, are those of the state, and stand still there too; what they
+    add is in `states` and `eigenvalues`.
+
+    **Raises:** `ValueError` for a state that is neither in equilibrium nor in steady motion. Inside JAX transformations
     nothing is raised, and the numbers are NaN.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
-    refuse_states(mechanism.forces, "linkax.linearise")
     if degrees_of_freedom is None:
         rank = concrete(_rank(mechanism, state, t))
         if rank is None:
@@ -184,6 +190,15 @@ def _check_steady(mechanism, state, t, steadiness):
             f"the state is {float(steadiness.off):.3g} off an equilibrium, in radians or lengths of the mechanism: "
             f"joint {joint!r} accelerates by {acceleration[column]:.6g} {when}; begin with linkax.equilibrium"
         )
+    of_states = np.asarray(steadiness.of_states)
+    if not np.max(of_states, initial=0.0) <= NEAR:
+        names = [f"{name!r} of {force.display_name}" for force in mechanism.forces for name in force.states]
+        counts = [entry.initial.size for force in mechanism.forces for entry in force.states.values()]
+        worst = np.repeat(names, counts)[np.argmax(of_states)]
+        raise ValueError(
+            f"the internal state {worst} changes {when}: it is {np.max(of_states):.3g} of its scale off where it "
+            "stands still; simulate until it rests"
+        )
     if not steadiness.changes <= CONSTANT:
         system = system_of(mechanism, state.q.dtype)
         names = ", ".join(map(repr, moving_joints(system, t, state.q, state.v[:, None])))
@@ -203,7 +218,7 @@ def _rank(mechanism, state, t):
 @Program
 def _linearise(mechanism, state, t, count, moves):
     """A `Linearisation`, the degrees of freedom counted at the state, and the `_Steadiness`."""
-    system = system_in(mechanism, state, t, moves)
+    system = bound(system_in(mechanism, state, t, moves), state.internal)
     v = state.v if moves else jnp.zeros(system.topology.num_speeds, system.dtype)
     moving = _Moving.of(system, TangentSpace().prepared(system.dtype), t, state.q, v)
     empty = jnp.sum(moving.basis**2, axis=0) == 0.0
@@ -211,7 +226,12 @@ def _linearise(mechanism, state, t, count, moves):
     (stiffness, damping), history = _coefficients(moving, columns, moves)
     basis, symmetric = moving.basis[:, columns], (stiffness + stiffness.T) / 2.0
     modes = _Modes.of(system, basis, lax.stop_gradient(symmetric), moving.v)
-    steadiness = _steadiness(moving, state, basis, modes, history)
+    states, of_states, felt = None, jnp.zeros(0, system.dtype), 0.0
+    if state.internal is not None:
+        units = scales(mechanism.forces, system.dtype)
+        states, of_states = _states(moving, basis, moving.dual[columns], state.internal, units)
+        felt = jnp.abs(modes.vectors.T @ states.force) @ units
+    steadiness = _steadiness(moving, state, basis, modes, history, felt)._replace(of_states=of_states)
     frequencies, mode_speeds = _frequencies(moving, basis, symmetric, damping, moves and count)
     linearisation = Linearisation(
         natural_frequencies=frequencies,
@@ -219,8 +239,29 @@ def _linearise(mechanism, state, t, count, moves):
         basis=basis,
         stiffness=stiffness,
         damping=damping,
+        states=states,
     )
     return linearisation, jnp.sum(jnp.logical_not(empty)), lax.stop_gradient(steadiness)
+
+
+def _states(moving, basis, dual, internal, units) -> tuple[StateSlopes, Float[Array, " n_s"]]:
+    """What internal states add, and how far each is off where it stands still, see `_Steadiness`."""
+    topology, still = moving.system.topology, jnp.zeros(basis.shape[1], internal.dtype)
+
+    def changes(y, y_rate, internal):
+        system = bound(moving.system, internal)
+        place = retract(topology, moving.q, basis @ y), moving.v + basis @ y_rate
+        v, acceleration, q, _ = moving.method.derivative(system, moving.t, *place, True)
+        return dual @ acceleration, internal_rates(move(configure(system, moving.t, q), v))
+
+    (_, rates), slopes = changes(still, still, internal), jax.jacfwd(changes, (0, 1, 2))(still, still, internal)
+    (_, _, force), (by_coordinates, by_speeds, by_states) = slopes
+    # The rate that each would have where all coordinates and states were off by one in their scales.
+    size = jax.vmap(moving.system.fastest, in_axes=1)(basis)
+    sensitivity = jnp.abs(by_coordinates) @ ratio(jnp.ones_like(size), size, 0.0) + jnp.abs(by_states) @ units
+    felt = jnp.abs(rates) > UNFELT * sensitivity
+    off = jnp.where(felt, ratio(jnp.abs(rates), sensitivity, jnp.inf), 0.0)
+    return StateSlopes(force, by_coordinates, by_speeds, by_states), off
 
 
 def _coefficients(moving, columns, moves):
@@ -276,13 +317,16 @@ class _Modes(NamedTuple):
         return _Modes(basis @ vectors, vectors, jnp.maximum(jnp.abs(values), system.fastest(v) ** 2))
 
 
-def _steadiness(moving, state, basis, modes, history) -> _Steadiness:
-    """How steady a motion is, from its `history` of coefficients and gaps, see `_coefficients`."""
+def _steadiness(moving, state, basis, modes, history, of_states) -> _Steadiness:
+    """How steady a motion is, from its `history` of coefficients and gaps, see `_coefficients`.
+
+    **Arguments:** `of_states`: accelerations of the modes by internal states in their scales, whose parts may cancel.
+    """
     system, (accelerations, stiffness, damping, opens) = moving.system, history
     size = jax.vmap(system.fastest, in_axes=1)(modes.of_joints)
     forces = largest_force(move(configure(system, moving.t, moving.q), moving.v))
     along = jnp.abs(accelerations @ modes.vectors)
-    felt = along > UNFELT * size * forces
+    felt = along > UNFELT * (size * forces + of_states)
     distance = jnp.where(felt, size * along, 0.0) / jnp.where(felt, modes.square, 1.0)
     worst = jnp.argmax(jnp.max(distance, axis=1, initial=0.0))
 
@@ -301,4 +345,5 @@ def _steadiness(moving, state, basis, modes, history) -> _Steadiness:
         off=jnp.max(distance, initial=0.0),
         acceleration=basis @ accelerations[worst],
         changes=jnp.max(jnp.stack([changes(stiffness, scale), changes(damping, jnp.sqrt(scale)), jnp.max(opens)])),
+        of_states=jnp.zeros(0, system.dtype),
     )
