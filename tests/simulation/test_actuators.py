@@ -8,6 +8,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import linkax as lx
+from linkax.scenery.scenery import spans
 
 TIMES = np.linspace(0.0, 0.5, 51)
 SPEED, START = 0.2, 0.5  # of the slider that a drive moves
@@ -145,6 +146,12 @@ def test_a_load_on_locked_oil_swings_as_on_a_spring():
     solution = lx.simulate(mechanism, state, t1=ts[-1], saveat=diffrax.SaveAt(ts=ts))
     moved = 100.0 / STIFFNESS * (1.0 - np.cos(frequency * ts))
     np.testing.assert_allclose(solution.joint("slide") - 0.7, moved, atol=1e-3 * 200.0 / STIFFNESS)
+
+
+def test_a_cylinder_is_drawn():
+    mechanism, _ = cylinder(0.0)
+    (span,) = spans(mechanism)
+    assert (span.kind, span.label) == ("damper", "cylinder: HydraulicCylinder")
 
 
 ARM = lx.rod("arm", 1.0, mass=1.0)

@@ -227,6 +227,17 @@ def test_a_network_may_be_a_force():
     np.testing.assert_allclose(jax.grad(end)(flat) @ along, central, rtol=1e-6)
 
 
+@pytest.mark.slow
+def test_a_fit_finds_numbers_and_initial_values():
+    measured = turned(pendulum(Motor(2.3, 0.4))).joint("pin")
+
+    def residual(params):
+        return (turned(pendulum(Motor(params["resistance"], params["current"]))).joint("pin") - measured) / 1e-3
+
+    found = lx.fit(residual, {"resistance": 2.0, "current": 0.1}, progress=False)
+    np.testing.assert_allclose([found.params["resistance"], found.params["current"]], [2.3, 0.4], rtol=1e-4)
+
+
 class WithoutRates(lx.AbstractForce):
     @property
     def states(self):

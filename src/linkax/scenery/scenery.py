@@ -17,7 +17,7 @@ from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import require_type
-from linkax.model.point_forces import Damper, Spring
+from linkax.model.point_forces import BetweenPoints, Spring
 from linkax.model.ropes import ElasticRope, Rope
 from linkax.scenery.camera import Camera, camera_for
 from linkax.simulation.read.by_name import BodyPoint
@@ -194,7 +194,7 @@ def principal_box(body: RigidBody) -> tuple[Float[np.ndarray, "3 3"], Float[np.n
 
 
 def spans(mechanism: Mechanism) -> list[Span]:
-    """All ropes, massless rods, springs, dampers and beams of a mechanism."""
+    """All ropes, massless rods, springs, dampers and beams of a mechanism; cylinders are drawn as dampers."""
     found: list[Span] = []
     for joint in mechanism.joints:
         if isinstance(joint, Distance):
@@ -204,7 +204,7 @@ def spans(mechanism: Mechanism) -> list[Span]:
             found.append(Span("rod" if len(rope.points) == 2 else "rope", f"{rope.name}: Rope", rope.points))
     for name, force in zip(mechanism.force_names, mechanism.forces, strict=True):
         label = f"{name}: {type(force).__name__}" if getattr(force, "name", None) else name
-        if isinstance(force, Spring | Damper):
+        if isinstance(force, BetweenPoints):
             found.append(Span("spring" if isinstance(force, Spring) else "damper", label, (force.first, force.second)))
         if isinstance(force, ElasticRope):
             found.append(Span("rope", label, force.points))
