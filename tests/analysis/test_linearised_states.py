@@ -1,4 +1,4 @@
-"""Small motions of elements with internal states."""
+"""Equilibria and small motions of elements with internal states."""
 
 import jax
 import jax.numpy as jnp
@@ -33,21 +33,28 @@ def test_its_derivative():
     np.testing.assert_allclose(slope, np.sqrt(STIFFNESS / MASS) / (2.0 * MODULUS), rtol=1e-7)
 
 
+ROD = lx.rod("rod", 1.0, mass=3.0)
+PIN = lx.Revolute("pin", lx.GROUND, ROD, "z")
+WEIGHT = 3.0 * 9.81 * 0.5
+
+
+def pendulum(*forces):
+    return lx.Mechanism([ROD], [PIN], [lx.Gravity([0.0, -9.81, 0.0]), *forces])
+
+
+def held(voltage, current=2.0):
+    return pendulum(
+        lx.DCMotor("pin", voltage, resistance=2.0, inductance=0.1, constant=1.5, current=current, name="motor")
+    )
+
+
 def test_a_motor_that_holds_a_pendulum():
     """Its current, and the angle at which weight and torque balance, at rest; the eigenvalues of a matrix by hand."""
-    rod = lx.rod("rod", 1.0, mass=3.0)
-    pin = lx.Revolute("pin", lx.GROUND, rod, "z")
-
-    def held(voltage):
-        motor = lx.DCMotor("pin", voltage, resistance=2.0, inductance=0.1, constant=1.5, current=2.0, name="motor")
-        return lx.Mechanism([rod], [pin], [lx.Gravity([0.0, -9.81, 0.0]), motor])
-
+    angle, inertia = -np.arccos(3.0 / WEIGHT), 1.0
     mechanism = held(4.0)
-    inertia, weight = 1.0, 3.0 * 9.81 * 0.5
-    angle = -np.arccos(3.0 / weight)
     state = lx.assemble(mechanism, {"pin": angle})
     small = lx.linearise(mechanism, state)
-    stiffness = -weight * np.sin(angle) / inertia
+    stiffness = -WEIGHT * np.sin(angle) / inertia
     by_hand = np.array([[0.0, 1.0, 0.0], [-stiffness, 0.0, 1.5 / inertia], [0.0, -15.0, -20.0]])
     expected = np.linalg.eigvals(by_hand)
     np.testing.assert_allclose(np.sort_complex(small.eigenvalues), np.sort_complex(expected), rtol=1e-9)
@@ -55,3 +62,52 @@ def test_a_motor_that_holds_a_pendulum():
     assert small.eigenvectors.shape == (1, 3)
     with pytest.raises(ValueError, match="internal state 'current' of DCMotor 'motor' changes at t = 0 s"):
         lx.linearise(held(4.1), state)
+
+
+def resting(voltage):
+    mechanism = held(voltage, current=0.0)
+    state = lx.equilibrium(mechanism, lx.assemble(mechanism, {"pin": -1.0}))
+    return jnp.stack([state.q[0], state.internal[0]])
+
+
+def test_an_equilibrium_has_currents_that_stand_still():
+    current = 4.0 / 2.0
+    np.testing.assert_allclose(resting(4.0), [-np.arccos(1.5 * current / WEIGHT), current], rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev], ids=["forward", "reverse"])
+def test_its_derivatives(mode):
+    slope = 1.5 / 2.0 / WEIGHT / np.sqrt(1.0 - (3.0 / WEIGHT) ** 2)
+    np.testing.assert_allclose(mode(resting)(4.0), [slope, 0.5], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_integrator_holds_its_target_in_equilibrium():
+    controller = lx.PIDController("pin", 0.5, proportional=60.0, integral=30.0, derivative=10.0, name="controller")
+    mechanism = pendulum(controller)
+    state = lx.equilibrium(mechanism, lx.assemble(mechanism, {"pin": 0.0}))
+    np.testing.assert_allclose(state.q, 0.5, rtol=1e-10)
+    np.testing.assert_allclose(state.internal, [WEIGHT * np.cos(0.5) / 30.0, 0.0], atol=1e-9)
+    assert np.max(lx.linearise(mechanism, state).eigenvalues.real) < 0.0
+
+
+class Counter(lx.AbstractForce):
+    """A clock, which never stands still."""
+
+    @property
+    def states(self):
+        return {"time": lx.InternalState(0.0, "s")}
+
+    def rates(self, t, motion, states):
+        return {"time": jnp.ones(())}
+
+    def load(self, t, motion, states):
+        return lx.Load.none(motion.system)
+
+
+@pytest.mark.slow
+def test_what_never_stands_still_has_no_equilibrium():
+    mechanism = pendulum(Counter())
+    with pytest.raises(lx.EquilibriumError, match="no equilibrium near this state"):
+        lx.equilibrium(mechanism, lx.assemble(mechanism, {"pin": -1.5}))

@@ -307,14 +307,12 @@ def test_a_mechanism_without_any_has_none():
     assert solution.end.internal is None
 
 
-def test_analyses_take_states_or_refuse_them(driven):
+def test_inverse_dynamics_takes_states(driven):
     state = dataclasses.replace(driven.end, v=jnp.zeros(1))
     mechanism = driven.mechanism
     held = lx.inverse_dynamics(mechanism, state, {"pin": 0.0}).forces["pin"]
     gravity = 9.81 * 0.5 * np.cos(state.q[0])
     np.testing.assert_allclose(held, gravity - CONSTANT * state.internal[0])
-    with pytest.raises(ValueError, match=r"Motor 'motor' has internal states, 'current', which linkax\.equilibrium"):
-        lx.equilibrium(mechanism, state)
 
 
 def test_states_are_plotted(driven):

@@ -1,5 +1,6 @@
 """Find an equilibrium, at rest or in steady motion, by a search downhill on the tangent space of the loops."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -7,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import ArrayLike, Bool, Float
 
-from linkax.analysis.equilibrium_search import MOST_STEPS, STATICS, Balanced, search_downhill
+from linkax.analysis.equilibrium_search import MOST_STEPS, STATICS, Balanced, search_downhill, search_standstill
 from linkax.analysis.steady import (
     AGREES,
     instants,
@@ -19,7 +20,7 @@ from linkax.analysis.steady import (
     widest_gap,
 )
 from linkax.equations.coordinates import retract
-from linkax.model.internal_states import refuse_states
+from linkax.equations.internal_states import bound
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.state import State
@@ -86,22 +87,25 @@ def equilibrium(mechanism: Mechanism, state: State, *, t: ArrayLike = 0.0) -> St
 
     **Returns:** the `State` in equilibrium.
 
-    **Raises:** `ValueError` for a force element with internal states; `EquilibriumError` where the search does not
-    converge, cannot close the loops or leave an unstable equilibrium, or where driven joints do not move steadily.
-    Inside JAX transformations nothing is raised, and coordinates are NaN.
+    Where force elements have internal states, such as currents and pressures, these stand still too. They have no
+    potential, so that the search takes stable and unstable equilibria alike: see the eigenvalues of `linkax.linearise`.
+    What the equations leave open, such as the pressure of locked oil, changes as little as they allow.
+
+    **Raises:** `EquilibriumError` where the search does not converge, cannot close the loops or leave an unstable
+    equilibrium, or where driven joints do not move steadily. Inside JAX transformations nothing is raised, and
+    coordinates are NaN.
 
     **Warns:** `StabilityWarning`.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
-    refuse_states(mechanism.forces, "linkax.equilibrium")
     moves = may_move(state) and any(constraint.is_driven for constraint in mechanism.constraints)
     reached, ending = _equilibrium(mechanism, state, t, moves)
     if not moves:
         # Concrete inside transformations too: whoever reads the state sees that nothing moves.
-        reached = State(reached.q, evaluate_now(jnp.zeros, reached.v.shape, reached.v.dtype), state.topology)
+        reached = dataclasses.replace(reached, v=evaluate_now(jnp.zeros, reached.v.shape, reached.v.dtype))
     if not all_concrete((reached, ending)):
         q = marked(mechanism, jnp.where(ending.is_sound, reached.q, jnp.nan))
-        return State(q, reached.v, state.topology)
+        return dataclasses.replace(reached, q=q)
     _check_steady(mechanism, ending, reached, t)
     if not ending.gap <= CLOSED:
         raise EquilibriumError(
@@ -146,7 +150,13 @@ def _check_steady(mechanism, ending, reached, t):
 def _equilibrium(mechanism, state, t, moves):
     """The state in which the search ends, and its `_Ending`."""
     system = system_in(mechanism, state, t, moves)
-    q, search = search_downhill(system, t, lax.stop_gradient(state.q))
+    internal = state.internal
+    if internal is None:
+        q, search = search_downhill(system, t, lax.stop_gradient(state.q))
+        lowest, circulation = search.lowest, search.circulation
+    else:
+        q, internal, search = search_standstill(system, t, *lax.stop_gradient((state.q, internal)))
+        system, lowest, circulation = bound(system, internal), jnp.zeros((), system.dtype), 0.0
     v, method = jnp.zeros(system.topology.num_speeds, system.dtype), STATICS.prepared(system.dtype)
     topology = system.topology
     missed, changes = jnp.zeros(topology.num_constraint_rows, system.dtype), jnp.zeros((), system.dtype)
@@ -157,10 +167,10 @@ def _equilibrium(mechanism, state, t, moves):
         rates = missed_rates(system, t, state.q, state.v)[-len(driven) :]
         missed = jnp.where(driven, rates, 0.0)
         changes = _changes(system, method, t, q, v)
-    unstable = search.lowest < 0.0
-    circulatory = unstable & (search.circulation > -search.lowest)
+    unstable = lowest < 0.0
+    circulatory = unstable & (circulation > -lowest)
     ending = _Ending(search.longest, gap, unstable & ~circulatory, circulatory, missed, changes)
-    return State(q, v, system.topology), lax.stop_gradient(ending)
+    return State(q, v, system.topology, internal), lax.stop_gradient(ending)
 
 
 def _changes(system, method, t, q, v):

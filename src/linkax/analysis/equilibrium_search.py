@@ -9,21 +9,24 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float, Int
 
-from linkax.analysis.steady import Nearby, eigh
+from linkax.analysis.steady import Nearby, eigh, largest_force
 from linkax.equations.constraint_rows import is_driven
 from linkax.equations.coordinates import retract
 from linkax.equations.dynamics import generalised_force
+from linkax.equations.internal_states import bound, internal_rates
 from linkax.equations.motion import Motion, move
 from linkax.equations.system import System
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
+from linkax.model.internal_states import scales
 from linkax.simulation.start.closing import LONGEST_STEP
 from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
 from linkax.xla.derivatives import pushforward, ratio
 
 MOST_STEPS = 200
+UNFELT = 1e-9  # forces that rounding leaves, relative to all forces; and rates, in scales of states [1/s]
 SMALLEST_STEP = 1e-12  # at which the search ends [rad, lengths of the mechanism]
 OVERSHOOT = 0.5  # work of the forces at the end of a step, against it, relative to their work at its start
 NEUTRAL = 1e-12  # stiffness, relative to the largest, up to which it counts as zero
@@ -145,3 +148,112 @@ def _jvp(primals, tangents):
 
     _, q_change = pushforward(moved, (system, t, zero), (system_change, t_change, change))
     return (q, search), (q_change, jax.tree.map(lambda _: None, search))
+
+
+class Standstill(NamedTuple):
+    """A search for coordinates and internal states of force elements at which forces balance and states stand still.
+
+    - `q`, `internal`: reached. `longest`: the largest part of the last step, or of what steps cannot balance [rad,
+      lengths of the mechanism, scales].
+    """
+
+    steps: Int[Array, ""]
+    q: Float[Array, " n_q"]
+    internal: Float[Array, " n_s"]
+    longest: Float[Array, ""]
+
+
+class _WithStates(NamedTuple):
+    """A mechanism near an equilibrium, displaced by z: y on the tangent space, and states in their scales.
+
+    `system`: whose forces are not bound to values of their states.
+    """
+
+    system: System
+    t: Float[Array, ""]
+    q: Float[Array, " n_q"]
+    internal: Float[Array, " n_s"]
+    near: Balanced
+
+    @staticmethod
+    def of(
+        system: System, t: Float[Array, ""], q: Float[Array, " n_q"], internal: Float[Array, " n_s"]
+    ) -> "_WithStates":
+        near = Balanced.of(bound(system, internal), STATICS.prepared(system.dtype), t, q)
+        return _WithStates(system, t, q, internal, near)
+
+    @property
+    def units(self) -> Float[Array, " n_s"]:
+        return scales([force.itself for force in self.system.forces], self.system.dtype)
+
+    @property
+    def nothing(self) -> Float[Array, " n"]:
+        return jnp.zeros(self.system.topology.num_speeds + len(self.internal), self.system.dtype)
+
+    def unbalanced(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Forces along y, less the reactions of the loops, and rates of the states in their scales."""
+        y, states = jnp.split(z, [self.system.topology.num_speeds])
+        system = bound(self.system, self.internal + self.units * states)
+        here = dataclasses.replace(self.near, system=system, t=self.t)
+        return jnp.concatenate([here.force(y), internal_rates(here.motion(y)[0]) / self.units])
+
+    def off(self, slopes: Float[Array, "n n"], unbalanced: Float[Array, " n"]) -> Float[Array, ""]:
+        """How far z would have to go to balance what is unbalanced most, infinite where nothing would."""
+        forces = largest_force(self.near.motion(jnp.zeros_like(self.system.scales))[0])
+        rounding = jnp.where(jnp.arange(len(unbalanced)) < len(self.system.scales), forces, 1.0) * UNFELT
+        felt = jnp.where(jnp.abs(unbalanced) > rounding, jnp.abs(unbalanced), 0.0)
+        return jnp.max(ratio(felt, jnp.sum(jnp.abs(slopes), axis=1), jnp.where(felt > 0.0, jnp.inf, 0.0)))
+
+    def step(self, slopes: Float[Array, "n n"], unbalanced: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The smallest z that balances what is unbalanced, to first order."""
+        size = jnp.max(jnp.abs(slopes), axis=1)
+        return -_pseudo_inverse(ratio(slopes, size[:, None])) @ ratio(unbalanced, size)
+
+
+@eqx.filter_custom_jvp
+def search_standstill(
+    system: System, t: Float[Array, ""], q: Float[Array, " n_q"], internal: Float[Array, " n_s"]
+) -> tuple[Float[Array, " n_q"], Float[Array, " n_s"], Standstill]:
+    """Coordinates and internal states of an equilibrium, by Newton's method, and the last `Standstill`.
+
+    What the equations leave open, such as the pressure of locked oil, changes as little as they allow.
+    """
+    method, zero = STATICS.prepared(system.dtype), jnp.zeros(system.topology.num_speeds, system.dtype)
+
+    def unfinished(search):
+        return (search.steps < MOST_STEPS) & (search.longest > SMALLEST_STEP)
+
+    def advance(search):
+        here = _WithStates.of(system, t, search.q, search.internal)
+        unbalanced, slopes = here.near.slopes(here.unbalanced, here.nothing)
+        step = here.step(slopes, unbalanced)
+        change, states = here.near.basis @ step[: len(zero)], step[len(zero) :]
+        size = system.fastest(change)
+        shorter = jnp.minimum(1.0, ratio(LONGEST_STEP, size))
+        q, _ = method.close(system, t, retract(system.topology, search.q, shorter * change), zero)
+        longest = jnp.maximum(jnp.maximum(size, jnp.max(jnp.abs(states))), here.off(slopes, unbalanced))
+        return Standstill(search.steps + 1, q, search.internal + shorter * here.units * states, longest)
+
+    q, _ = method.close(system, t, q, zero)
+    begin = Standstill(jnp.zeros((), int), q, internal, jnp.asarray(jnp.inf, system.dtype))
+    search = lax.while_loop(unfinished, advance, begin)
+    return search.q, search.internal, search
+
+
+@search_standstill.def_jvp
+def _standstill_jvp(primals, tangents):
+    """Derivatives, to any order, of where forces balance and states stand still."""
+    (system, t, *begin), (system_change, t_change, *_) = primals, tangents
+    q, internal, search = search_standstill(system, t, *begin)
+    here = _WithStates.of(system, t, q, internal)
+    zero = jnp.zeros(system.topology.num_speeds, system.dtype)
+    left = lambda system, t: here._replace(system=system, t=t).unbalanced(here.nothing)
+    _, unbalanced = pushforward(left, (system, t), (system_change, t_change))
+    change = here.step(here.near.slopes(here.unbalanced, here.nothing)[1], unbalanced)
+
+    def moved(system, t, y):
+        return here.near.method.close(system, t, retract(system.topology, q, here.near.basis @ y), zero)[0]
+
+    _, q_change = pushforward(moved, (system, t, zero), (system_change, t_change, change[: len(zero)]))
+    of_search = jax.tree.map(lambda _: None, search)
+    return (q, internal, search), (q_change, here.units * change[len(zero) :], of_search)

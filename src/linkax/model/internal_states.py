@@ -102,17 +102,3 @@ def joined_rates(
 
 def _joined(arrays, dtype):
     return jnp.concatenate([jnp.ravel(jnp.asarray(array, dtype)) for array in arrays])
-
-
-def refuse_states(forces: Sequence[Any], what: str) -> None:
-    """Raise where a force element has internal states, for a function `what` that does not know them.
-
-    **Raises:** `ValueError` that names the element.
-    """
-    for force in forces:
-        if force.states:
-            names = ", ".join(map(repr, force.states))
-            raise ValueError(
-                f"{force.display_name} has internal states, {names}, which {what} does not know; put a force without "
-                "states in its place, such as linkax.JointTorque or linkax.PointForce"
-            )
