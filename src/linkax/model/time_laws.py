@@ -106,6 +106,7 @@ def _across(widths, values):
 
 def _slopes(xp, widths, chords, first, last):
     """Slopes at all times that make the second derivative continuous, (n, ...)."""
+    # SciPy's splines need known times; these may be traced, such as the duration of a motion.
     before, after, zero, one = widths[:-1], widths[1:], xp.zeros(1), xp.ones(1)
     diagonals = [after, zero], [one, 2.0 * (before + after), one], [zero, before]
     matrix = sum(xp.diag(xp.concatenate(parts), offset) for parts, offset in zip(diagonals, (-1, 0, 1), strict=True))
