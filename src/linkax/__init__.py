@@ -62,6 +62,7 @@ from linkax.model.constraints import Coupling as Coupling  # noqa: E402
 from linkax.model.constraints import Drive as Drive  # noqa: E402
 from linkax.model.controllers import FirstOrderSensor as FirstOrderSensor  # noqa: E402
 from linkax.model.controllers import PIDController as PIDController  # noqa: E402
+from linkax.model.contact_law import ContactLaw as ContactLaw  # noqa: E402
 from linkax.model.curves import PeriodicSpline as PeriodicSpline  # noqa: E402
 from linkax.model.curves import SplineCurve as SplineCurve  # noqa: E402
 from linkax.model.forces import AbstractForce as AbstractForce  # noqa: E402
@@ -72,10 +73,12 @@ from linkax.model.gears import Rack as Rack  # noqa: E402
 from linkax.model.guides import PointOnSurface as PointOnSurface  # noqa: E402
 from linkax.model.guides import Prescribed as Prescribed  # noqa: E402
 from linkax.model.internal_states import InternalState as InternalState  # noqa: E402
+from linkax.model.impacts import Impact as Impact  # noqa: E402
 from linkax.model.joint_forces import JointDamper as JointDamper  # noqa: E402
 from linkax.model.joint_forces import JointFriction as JointFriction  # noqa: E402
 from linkax.model.joint_forces import JointSpring as JointSpring  # noqa: E402
 from linkax.model.joint_forces import JointTorque as JointTorque  # noqa: E402
+from linkax.model.joint_limits import JointLimit as JointLimit  # noqa: E402
 from linkax.model.joints.bending import Sliding as Sliding  # noqa: E402
 from linkax.model.joints.cam import Cam as Cam  # noqa: E402
 from linkax.model.joints.constant_velocity import ConstantVelocity as ConstantVelocity  # noqa: E402
@@ -113,6 +116,9 @@ from linkax.model.sections import Material as Material  # noqa: E402
 from linkax.model.sections import Section as Section  # noqa: E402
 from linkax.model.sections import circle as circle  # noqa: E402
 from linkax.model.sections import rectangle as rectangle  # noqa: E402
+from linkax.model.shapes import Capsule as Capsule  # noqa: E402
+from linkax.model.shapes import Plane as Plane  # noqa: E402
+from linkax.model.shapes import Sphere as Sphere  # noqa: E402
 from linkax.model.terms import Term as Term  # noqa: E402
 from linkax.model.time_laws import PiecewiseLinear as PiecewiseLinear  # noqa: E402
 from linkax.model.time_laws import Spline as Spline  # noqa: E402

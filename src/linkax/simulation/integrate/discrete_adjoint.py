@@ -137,7 +137,7 @@ def _integrate_jvp(primals, tangents):
     )
     if not track:
         return (integrated, None), (to_integrated, None)
-    to_times = jnp.zeros_like(steps.ts).at[steps.count].set(end).at[0].set(begin)
+    to_times = trajectory.times.at[steps.count].set(end)
     return (integrated, steps), (to_integrated, Steps(to_times, trajectory.steps, None))
 
 
@@ -159,7 +159,7 @@ def _abstract(solver, every, ivp, steps, restored, flat):
     n = ivp.y0.shape
     of = lambda shape: ShapedArray(shape, ivp.y0.dtype)
     saved = None if ivp.saved is None else of(ivp.saved.shape + n)
-    shapes: Any = saved, of(n), of(steps.ys.shape) if every else None
+    shapes: Any = saved, of(n), *((of(steps.ys.shape), of(steps.ts.shape)) if every else (None, None))
     return Trajectory(*shapes)
 
 

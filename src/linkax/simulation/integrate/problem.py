@@ -18,6 +18,7 @@ from linkax.model.internal_states import scales
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack
+from linkax.simulation.integrate.impacts import at_rest
 from linkax.simulation.integrate.switches import Sides, held, values
 from linkax.simulation.start.state import State
 from linkax.straight_line.transform import straight_line
@@ -72,13 +73,22 @@ class Problem(eqx.Module):
         return of_motion, of_motion, *([scales(forces, of_motion.dtype)] if num_states(self.system) else [])
 
     def sides(self, y: Float[Array, " n"]) -> Sides:
-        """The sides of switches on which force elements are held, (m,); none where steps do not adapt to them."""
+        """What y keeps of switches, the sides on which force elements are held; none where steps do not adapt."""
         sides = self._parts(y)[0]
         return sides if len(sides) else ()
 
-    def on_sides(self, y: Float[Array, " n"], sides: Float[Array, " m"]) -> Float[Array, " n"]:
+    def on_sides(self, y: Float[Array, " n"], sides: Float[Array, " kept"]) -> Float[Array, " n"]:
         """The same vector with other sides."""
         return jnp.concatenate([sides, y[len(sides) :]])
+
+    def with_speeds(self, y: Float[Array, " n"], v: Float[Array, " n_v"]) -> Float[Array, " n"]:
+        """The same vector with other speeds."""
+        first = len(self.sides(y)) + self.system.topology.num_coordinates
+        return jnp.asarray(y).at[first : first + len(v)].set(v)
+
+    def can_go_on(self, y: Float[Array, " n"]) -> Bool[Array, ""] | bool:
+        """Whether a step may be taken from a vector."""
+        return self.can_start & jnp.logical_not(at_rest(self.system, self.sides(y)))
 
     def switches(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " m"]:
         """Values of the switches at a vector, (m,)."""

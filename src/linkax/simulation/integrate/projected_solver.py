@@ -227,12 +227,12 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
             fixed = without_derivatives((args, t0, t1, y0, y1))
             switch, sides = lax.stop_gradient(meet(*fixed, within=within))
-            y1 = args.on_sides(y1, sides) if self.is_undifferentiated else crossed(args, t1, y1, sides)
+            _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
         state = SolverState(inner, arrives, closest)
         return y1, StepError(errors, leaves, passes, retry, switch), dense_info, state, result
 
     def corrected(
         self, problem: Problem, t1: Float[Array, ""], y1: Float[Array, " n"], sides: Sides
-    ) -> Float[Array, " n"]:
-        """Correct the state after a step, and put it on these sides of switches."""
-        return crossed(problem, t1, problem.corrected(t1, y1)[0] if self.after_step else y1, sides)
+    ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+        """Correct the state after a step, and put it on these sides of switches: when, and where motion goes on."""
+        return crossed(problem, t1, problem.corrected(t1, y1)[0] if self.after_step else y1, sides, "time")

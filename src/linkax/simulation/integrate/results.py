@@ -45,6 +45,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  Equ
         "of what it can be, such as a negative length; give finite ones. Outside of JAX transformations such a "
         "mechanism is refused, by an error that names the number."
     )
+    rests_on_stop = (
+        "The motion comes to rest on the stop of a `linkax.Impact`, after bounces that follow each other ever faster, "
+        "or begins beyond it. Take a `linkax.JointLimit` or a `linkax.Contact`, which holds it, or end the run before."
+    )
     not_reached = "The branch does not lead to all values: it turns back before, or ends where another one crosses."
 
 
@@ -61,6 +65,7 @@ KNOWN_RESULTS = (
     "massless",
     "not_finite",
     "times_out_of_order",
+    "rests_on_stop",
     "not_reached",
 )
 

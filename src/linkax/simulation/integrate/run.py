@@ -19,6 +19,7 @@ from linkax.model.numbers import Number, require_type
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.discrete_adjoint import has_discrete_adjoint
+from linkax.simulation.integrate.impacts import impacts_of
 from linkax.simulation.integrate.options import (
     check_accuracy,
     check_kinds,
@@ -98,6 +99,11 @@ class Run(eqx.Module):
         check_kinds(**{name: entry for name, entry in given.items() if name not in ("dt0", "max_steps")})
         formulation = checked_formulation(formulation, accuracy)
         options = _filled_in(mechanism, state, accuracy, t0, t1, **given)
+        if (stops := impacts_of(mechanism)) and not MechanismControl(options.controller).is_adaptive:
+            raise ValueError(
+                f"{stops[0].display_name} needs steps that end where an impact happens, and stepsize_controller is "
+                f"{options.controller!r}; leave it out, or give a linkax.JointLimit or Contact in place of the impact"
+            )
         flat, state, t0, accuracy = cast((flat_with_known(mechanism), state, t0, accuracy), dtype)
         return Run(flat, state, t0, t1, formulation, accuracy, saves_times(options.saveat), Flat.of(options))
 

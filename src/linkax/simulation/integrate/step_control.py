@@ -109,8 +109,9 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         )
         # A step size that is not a number does not proceed either.
         proceeds = next_t1 - next_t0 > SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t1), 1e-3)
-        keep = keep & args.can_start
-        result = diffrax.RESULTS.where(keep | (proceeds & args.can_start), result, diffrax.RESULTS.dt_min_reached)
+        goes_on = args.can_go_on(y0)
+        keep = keep & goes_on
+        result = diffrax.RESULTS.where(keep | (proceeds & goes_on), result, diffrax.RESULTS.dt_min_reached)
         if not self.is_adaptive:
             finite = jnp.all(jnp.isfinite(y1_candidate))
             result = diffrax.RESULTS.where(finite, result, diffrax.RESULTS.dt_min_reached)

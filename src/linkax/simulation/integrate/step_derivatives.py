@@ -2,7 +2,8 @@
 
 What diffrax integrates with steps chosen as it goes, is here differentiated as it was computed, with those steps given.
 Each equation of motion compiles once for its tangent and once for its cotangent, where differentiating the loop over
-steps itself needs seven copies.
+steps itself needs seven copies. A step that ends at a switch ends there as parameters change too, and those after it
+move along, so that each begins as far from the kink as it did.
 """
 
 import functools
@@ -40,11 +41,15 @@ class Steps(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """The states of a motion that have derivatives: at saved times, at the end, at all steps where asked for."""
+    """The states of a motion that have derivatives: at saved times, at the end, at all steps where asked for.
+
+    `times`: those of the steps, of which switches move some.
+    """
 
     saved: Float[Array, "k n"] | None
     end: Float[Array, " n"]
     steps: Float[Array, "ends n"] | None = None
+    times: Float[Array, " ends"] | None = None
 
 
 class Tableau(NamedTuple):
@@ -81,13 +86,13 @@ def _uncorrected(solver, problem, t0, t1, y0):
 
 
 def _step(solver: ProjectedSolver, problem: Problem, t0, t1, y0, sides):
-    """One step and the correction after it: (y1 on the sides after the step, what interpolates in the step)."""
+    """One step and the correction after it: (when and where the next begins, what interpolates in the step)."""
     dense = _uncorrected(solver, problem, t0, t1, y0)
     return solver.corrected(problem, t1, dense["y1"], sides), dense
 
 
-def _step_vjp(solver: ProjectedSolver, of_problem, problem, t0, t1, dense, sides, y1_bar, dense_bar):
-    """VJP of one step: cotangents of (y1, dense output) ↦ cotangents of (problem, t0, t1, y0).
+def _step_vjp(solver: ProjectedSolver, of_problem, problem, t0, t1, dense, sides, after_bar, dense_bar):
+    """VJP of one step: cotangents of ((t, y) after it, dense output) ↦ cotangents of (problem, t0, t1, y0).
 
     `of_problem`: rebuilds the `Problem` from its differentiated leaves. `sides`: see `_step`.
     """
@@ -97,7 +102,7 @@ def _step_vjp(solver: ProjectedSolver, of_problem, problem, t0, t1, dense, sides
     result = jnp.asarray(table.result, y0.dtype)
     corrected = lambda problem, t, y: solver.corrected(of_problem(problem), t, y, sides)
     rates = lambda problem, t, y: of_problem(problem).derivative(t, y)
-    problem_bar, t1_bar, y_bar = jax.vjp(corrected, problem, t1, dense["y1"])[1](y1_bar)
+    problem_bar, t1_bar, y_bar = jax.vjp(corrected, problem, t1, dense["y1"])[1](after_bar)
     y_bar = y_bar + dense_bar["y1"]
     k_bar = dense_bar["k"] + result[:, None] * y_bar
 
@@ -137,13 +142,14 @@ def tangents_over_steps(
         return _step(solver, problem, t0, t1, y, sides)
 
     def one(carry):
-        k, j, y, motion = carry
+        k, j, y, moves, motion = carry
         ends = steps.ts[k], steps.ts[k + 1]
-        begin_dot = jnp.where(k == 0, materialise(ivp.t0, tangents.t0), 0.0)
-        end_dot = jnp.where(k == last, materialise(ivp.t1, tangents.t1), 0.0)
+        begin_dot = jnp.where(k == 0, materialise(ivp.t0, tangents.t0), moves)
+        end_dot = jnp.where(k == last, materialise(ivp.t1, tangents.t1), moves)
         moved = tangents.problem, begin_dot, end_dot, motion.end
         sides = ivp.problem.sides(steps.ys[k + 1])
-        (y, dense), (y_dot, dense_dot) = eqx.filter_jvp(functools.partial(step, sides), (ivp.problem, *ends, y), moved)
+        at = ivp.problem, *ends, y
+        ((_, y), dense), ((moves, y_dot), dense_dot) = eqx.filter_jvp(functools.partial(step, sides), at, moved)
 
         def save(carry):
             j, found = carry
@@ -154,14 +160,16 @@ def tangents_over_steps(
         found = motion.saved
         if saves:
             j, found = lax.while_loop(lambda carry: _reached(saved, carry[0], ends[1]), save, (j, found))
-        return k + 1, j, y, Trajectory(found, y_dot, motion.steps.at[k + 1].set(y_dot) if every else None)
+        each = lambda rows, row: rows.at[k + 1].set(row) if every else None
+        return k + 1, j, y, moves, Trajectory(found, y_dot, each(motion.steps, y_dot), each(motion.times, moves))
 
     motion = Trajectory(
         saved=jnp.zeros((len(saved), len(y0)), y0.dtype) if saves else None,
         end=materialise(y0, tangents.y0),
         steps=jnp.zeros_like(steps.ys).at[0].set(materialise(y0, tangents.y0)) if every else None,
+        times=jnp.zeros_like(steps.ts).at[0].set(materialise(ivp.t0, tangents.t0)) if every else None,
     )
-    begin = jnp.zeros((), int), jnp.zeros((), int), y0, motion
+    begin = jnp.zeros((), int), jnp.zeros((), int), y0, jnp.zeros_like(ivp.t0), motion
     return lax.while_loop(lambda carry: carry[0] < count, one, begin)[-1]
 
 
@@ -182,7 +190,7 @@ def cotangents_over_steps(
     of_problem = lambda problem: eqx.combine(problem, fixed)
 
     def one(carry):
-        k, j, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = carry
+        k, j, y_bar, moves_bar, problem_bar, t0_bar, t1_bar, saved_bar = carry
         ends = steps.ts[k], steps.ts[k + 1]
         dense = _uncorrected(solver, ivp.problem, *ends, steps.ys[k])
         zero = jnp.zeros_like(ends[0])
@@ -192,19 +200,21 @@ def cotangents_over_steps(
         j, begin_bar, end_bar, dense_bar, saved_bar = of_step
         sides = ivp.problem.sides(steps.ys[k + 1])
         more, begin_more, end_more, y_bar = _step_vjp(
-            solver, of_problem, problem, *ends, dense, sides, y_bar, dense_bar
+            solver, of_problem, problem, *ends, dense, sides, (moves_bar, y_bar), dense_bar
         )
         problem_bar = jax.tree.map(jnp.add, problem_bar, more)
-        t0_bar = jnp.where(k == 0, begin_bar + begin_more, t0_bar)
-        t1_bar = jnp.where(k == last, end_bar + end_more, t1_bar)
-        return k - 1, j, y_bar, problem_bar, t0_bar, t1_bar, saved_bar
+        begin_bar, end_bar = begin_bar + begin_more, end_bar + end_more
+        t0_bar = jnp.where(k == 0, begin_bar, t0_bar)
+        t1_bar = jnp.where(k == last, end_bar, t1_bar)
+        moves_bar = begin_bar + jnp.where(k == last, 0.0, end_bar)
+        return k - 1, j, y_bar, moves_bar, problem_bar, t0_bar, t1_bar, saved_bar
 
     zero = jnp.zeros((), steps.ts.dtype)
     finish = steps.ts[steps.count]
     count = 0 if saved is None else jnp.sum(saved <= finish)
     saved_bar = None if saved is None else jnp.zeros_like(saved)
-    begin = last, count - 1, cotangent.end, jax.tree.map(jnp.zeros_like, problem), zero, zero, saved_bar
-    *_, y_bar, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(lambda carry: carry[0] >= 0, one, begin)
+    begin = last, count - 1, cotangent.end, zero, jax.tree.map(jnp.zeros_like, problem), zero, zero, saved_bar
+    *_, y_bar, _, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(lambda carry: carry[0] >= 0, one, begin)
     return eqx.filter(InitialValueProblem(problem_bar, y_bar, t0_bar, t1_bar, saved_bar), wanted)
 
 

@@ -65,7 +65,16 @@ def _between(solution, ts):
     if solution.internal is not None:
         states = *states, solution.internal, *read_in_motion(Observables.internal_changes, solution)
     ts, q, v, *internal = _interpolated(solution.mechanism.topology, ts.astype(solution.ts.dtype), *states)
-    return dataclasses.replace(solution, ts=ts, q=q, v=v, internal=internal[0] if internal else None)
+    record = None if solution.impact_record is None else _of_impacts(solution, ts)
+    internal = internal[0] if internal else None
+    return dataclasses.replace(solution, ts=ts, q=q, v=v, internal=internal, impact_record=record)
+
+
+def _of_impacts(solution, ts):
+    """The record of impacts at times: that of the last saved time before."""
+    before = lambda saved, record, t: record[jnp.maximum(jnp.searchsorted(saved, t, side="right") - 1, 0)]
+    found = jnp.vectorize(before, signature="(k),(k,a,b),(n)->(n,a,b)")(solution.ts, solution.impact_record, ts)
+    return jnp.where(jnp.isfinite(ts)[..., None, None], found, jnp.inf)
 
 
 @jit_inline

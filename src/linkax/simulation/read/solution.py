@@ -13,13 +13,15 @@ from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.elements import AbstractElement
 from linkax.model.forces import AbstractForce
+from linkax.model.impacts import Impact
 from linkax.model.joints.distance import Distance
 from linkax.model.mechanism import Mechanism
-from linkax.model.names import ByName
+from linkax.model.names import ByName, find
 from linkax.model.numbers import Number, Vector, number, require
 from linkax.simulation.explain.error_estimate import refined_run
 from linkax.simulation.explain.remarks import remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
+from linkax.simulation.integrate.impacts import impacts_of, record
 from linkax.simulation.integrate.integrate import Outcome, integrate_run
 from linkax.simulation.integrate.options import check_accuracy
 from linkax.simulation.integrate.results import REMARKS, RESULTS
@@ -64,6 +66,8 @@ class Solution(Kinematics):
     - `closest`: smallest distance from a singular configuration at any stage of any step; one where
       the formulation does not measure it. Without derivative, which `singularity_distance` has.
       `average`: the mean of that distance over the run.
+    - `impact_record`: of each `linkax.Impact` how many there were since t0, and what energy they took [J], (n_t, 2, k);
+      see `impacts`. None where there are none.
     - `definiteness`: of the mass matrix at the start, with whose inverse rounding of accelerations grows.
 
     All that is read by the methods below comes as arrays with times as the first axis, in ground
@@ -85,6 +89,7 @@ class Solution(Kinematics):
     average: Float[Array, "*batch"] | np.floating
     definiteness: Float[Array, "*batch"] | np.floating
     interpolation: Any
+    impact_record: Float[Array, "*batch n_t 2 stops"] | None = None
 
     @property
     def accuracy(self) -> Accuracy:
@@ -116,6 +121,7 @@ class Solution(Kinematics):
             average=integrated.average,
             definiteness=initial.definiteness,
             interpolation=integrated.interpolation,
+            impact_record=record(run.mechanism, integrated.ys) if saved and impacts_of(run.mechanism) else None,
         )
 
     def another(self, run: Run) -> "Solution":
@@ -221,10 +227,28 @@ class Solution(Kinematics):
         """Work of each element that puts energy in or takes it out, since the first saved time [J], (n_t,), by name.
 
         These are force elements beyond the fall of their potential energy (dampers, torques, forces of your own), by
-        `Mechanism.force_names`, and constraints that change with time (drives, winches). Between saved times the motion
-        is interpolated, with an error of work in proportion to the sixth power of the time between them.
+        `Mechanism.force_names`, impacts, and constraints that change with time (drives, winches). Between saved times
+        the motion is interpolated, with an error of work in proportion to the sixth power of the time between them.
         """
         return kept(self, "work", lambda: work(self))
+
+    def impacts(self, name: str) -> Int[Array, "*batch n_t"]:
+        """How many impacts on a stop there were since the run began, (n_t,); -1 at times that were not reached.
+
+        **Arguments:** `name`: of a `linkax.Impact`, one of `mechanism.force_names`.
+
+        **Raises:** `ValueError` for another name, and for states without the run that led to them.
+        """
+        stops = [
+            name
+            for name, force in zip(self.mechanism.force_names, self.mechanism.forces, strict=True)
+            if isinstance(force, Impact)
+        ]
+        index = find(name, stops, "impact")
+        if self.impact_record is None:
+            raise ValueError("this solution is of states without the run that led to them; simulate, and save states")
+        counts = self.impact_record[..., 0, index]
+        return jnp.where(jnp.isfinite(counts), counts, -1.0).astype(int)
 
     def unaccounted_energy(self) -> Float[Array, "*batch n_t"]:
         """Change of `energy` since the first saved time, less all `work` [J]: an error.

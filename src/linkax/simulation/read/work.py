@@ -1,4 +1,4 @@
-"""Work of force elements and drives over a motion, between its saved times too."""
+"""Work of force elements, impacts and drives over a motion, between its saved times too."""
 
 from typing import Any
 
@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from linkax.model.impacts import Impact
 from linkax.model.names import ByName
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.interpolation import motion_between
@@ -30,6 +31,15 @@ def work(solution: Solution) -> dict[str, Float[Array, "*batch n_t"]]:
         powers = [read(Observables.powers_of_forces, between)] if forces else []
         powers += [read_in_motion(Observables.powers_of_drives, between)] if drives else []
         works = _integrals(solution.ts, powers)
+    if solution.impact_record is not None:
+        stops = [
+            name
+            for name, force in zip(mechanism.force_names, mechanism.forces, strict=True)
+            if isinstance(force, Impact)
+        ]
+        taken = solution.impact_record[..., 1, :]
+        since = jnp.where(jnp.isfinite(taken), taken[..., :1, :] - taken, jnp.inf)
+        names, works = [*names, *stops], [*works, *jnp.moveaxis(since, -1, 0)]
     return ByName(dict(zip(names, works, strict=True)), "element that does work")
 
 

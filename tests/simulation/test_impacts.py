@@ -1,0 +1,244 @@
+"""Impacts on rigid stops: closed forms, loops, energies and derivatives, and where bounces accumulate."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+from linkax.equations.configuration import configure
+from linkax.equations.system import system_of
+
+G = 9.81
+GRAVITY = lx.Gravity([0.0, -G, 0.0])
+PRECISE = lx.Accuracy(rtol=1e-10)
+STEP = 1e-4  # of central differences
+
+
+def ball(restitution):
+    """A ball that falls on a floor."""
+    body = lx.point_mass("ball", 1.3)
+    rail = lx.Prismatic("rail", lx.GROUND, body, "y")
+    return lx.Mechanism([body], [rail], [GRAVITY, lx.Impact("rail", lower=0.0, restitution=restitution, name="floor")])
+
+
+def height(t, restitution, start):
+    """That of the ball in closed form, from rest at a height."""
+    landing = np.sqrt(2.0 * start / G)
+    if t < landing:
+        return start - G * t**2 / 2.0
+    speed = restitution * G * landing
+    while t > landing + 2.0 * speed / G:
+        landing, speed = landing + 2.0 * speed / G, restitution * speed
+    return speed * (t - landing) - G * (t - landing) ** 2 / 2.0
+
+
+TIMES = np.linspace(0.0, 5.5, 111)
+
+
+@jax.jit
+@jax.vmap
+def bounces(numbers):
+    """Heights of the ball, impacts so far and energies unaccounted for, by (restitution, height at the start)."""
+    start = lx.State(numbers[1:], jnp.zeros(1))
+    run = lx.simulate(ball(numbers[0]), start, t1=TIMES[-1], accuracy=PRECISE, saveat=diffrax.SaveAt(ts=TIMES))
+    return run.q[:, 0], run.impacts("floor"), run.unaccounted_energy(), run.work()["floor"]
+
+
+@jax.jit
+def final_height(numbers):
+    start, saveat = lx.State(numbers[1:], jnp.zeros(1)), diffrax.SaveAt(t1=True)
+    return lx.simulate(ball(numbers[0]), start, t1=TIMES[-1], accuracy=PRECISE, saveat=saveat).end.q[0]
+
+
+NUMBERS = np.array([[0.95, 0.4], [0.8, 2.0], [1.0, 1.0]])
+
+
+def test_a_ball_bounces_as_in_closed_form():
+    """Ten bounces and more, members of a batch with impacts of their own."""
+    heights, impacts, unaccounted, work = map(np.asarray, bounces(jnp.asarray(NUMBERS)))
+    exact = np.array([[height(t, *numbers) for t in TIMES] for numbers in NUMBERS])
+    np.testing.assert_allclose(heights, exact, atol=1e-9)
+    assert impacts[0, -1] >= 10
+    np.testing.assert_allclose(unaccounted, 0.0, atol=1e-9)
+    fallen = (NUMBERS[:, 0] ** (2 * impacts[:, -1]) - 1.0) * 1.3 * G * NUMBERS[:, 1]
+    np.testing.assert_allclose(work[:, -1], fallen, atol=1e-9)
+
+
+def differences(function, x):
+    """Derivatives by central differences of fourth order."""
+    rise = lambda e: function(x + e) - function(x - e)
+    return np.stack([(8.0 * rise(e) - rise(2.0 * e)) / (12.0 * STEP) for e in STEP * np.eye(len(x))], axis=-1)
+
+
+def test_derivatives_through_ten_impacts():
+    """Forwards and backwards, against those of the closed form."""
+    for numbers in NUMBERS[:2]:
+        exact = differences(lambda x: np.array(height(TIMES[-1], *x)), numbers)
+        np.testing.assert_allclose(jax.jit(jax.jacfwd(final_height))(numbers), exact, rtol=1e-6)
+        np.testing.assert_allclose(jax.jit(jax.grad(final_height))(numbers), exact, rtol=1e-6)
+
+
+def pendulum(stop, restitution=0.8):
+    """A rod that hangs from a hinge, against a stop at the angle from straight down."""
+    rod = lx.rod("rod", 1.0, 2.0)
+    hinge = lx.Revolute("hinge", lx.GROUND, rod.at("base"), "z")
+    impact = lx.Impact("hinge", lower=stop - np.pi / 2.0, restitution=restitution, name="stop")
+    return lx.Mechanism([rod], [hinge], [GRAVITY, impact])
+
+
+@pytest.mark.slow
+def test_a_pendulum_hit_at_the_bottom_ten_times():
+    """Each hit leaves the square of the restitution of the energy; the time of a swing is an elliptic integral."""
+    angle, restitution = 1.0, 0.9
+    agm = lambda a, b: a if abs(a - b) < 1e-15 else agm((a + b) / 2.0, np.sqrt(a * b))
+    half = lambda top: np.pi / np.sqrt(1.5 * G) / agm(1.0, np.cos(top / 2.0))  # half a period at an amplitude
+    tops = [angle]
+    for _ in range(10):
+        tops.append(2.0 * np.arcsin(restitution * np.sin(tops[-1] / 2.0)))
+    ends = half(angle) / 2.0 + np.cumsum([half(top) for top in tops[1:]])
+    ts = np.concatenate([[0.0], ends - np.array([half(top) for top in tops[1:]]) / 2.0])
+    start = lx.State(jnp.array([angle - np.pi / 2.0]), jnp.zeros(1))
+    saveat = diffrax.SaveAt(ts=ts)
+    run = lx.simulate(pendulum(0.0, restitution), start, t1=ts[-1], accuracy=lx.Accuracy(rtol=1e-12), saveat=saveat)
+    np.testing.assert_array_equal(run.impacts("stop"), np.arange(11))
+    np.testing.assert_allclose(run.q[:, 0] + np.pi / 2.0, tops, atol=1e-9)
+    np.testing.assert_allclose(run.v[:, 0], 0.0, atol=1e-9)
+    energy = np.asarray(run.energy()) + G
+    np.testing.assert_allclose(energy, energy[0] * restitution ** (2 * np.arange(11)), rtol=1e-9)
+
+
+def four_bar(numbers):
+    """A four-bar whose tip of the coupler meets a wall, and whose rocker has a stop, by (restitution, wall, stop)."""
+    restitution, wall, stop = numbers
+    crank, coupler, rocker = lx.rod("crank", 0.3, 1.0), lx.rod("coupler", 0.7, 1.0), lx.rod("rocker", 0.6, 1.0)
+    joints = [
+        lx.Revolute("A", lx.GROUND, crank.at("base"), "z"),
+        lx.Revolute("B", crank.at("tip"), coupler.at("base"), "z"),
+        lx.Revolute("C", coupler.at("tip"), rocker.at("tip"), "z", cut=True),
+        lx.Revolute("D", lx.GROUND.at([0.8, 0.0, 0.0]), rocker.at("base"), "z"),
+    ]
+    facing_left = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    plane = lx.Plane(lx.GROUND.at(jnp.stack([wall, 0.0, 0.0]), facing_left))
+    impacts = [
+        lx.Impact(plane, lx.Sphere(coupler.at("tip"), 0.05), restitution=restitution, name="wall"),
+        lx.Impact("D", upper=stop, restitution=restitution, name="stop"),
+    ]
+    return lx.Mechanism([crank, coupler, rocker], joints, [GRAVITY, *impacts])
+
+
+FOUR_BAR = jnp.array([0.8, 0.8, 2.1])
+
+
+@pytest.fixture(scope="module")
+def start():
+    mechanism = four_bar(FOUR_BAR)
+    return lx.assemble(mechanism, {"A": 1.2}, {"A": -9.0}, guess={"D": 1.9, "B": -0.6})
+
+
+def simulated(numbers, start, saveat, **options):
+    return lx.simulate(four_bar(numbers), start, t1=1.0, accuracy=PRECISE, saveat=saveat, **options)
+
+
+@pytest.mark.parametrize("formulation", ["tangent-space", pytest.param("lagrange-multipliers", marks=pytest.mark.slow)])
+def test_loops_stay_closed_and_gaps_open(start, formulation):
+    """Energy is accounted for, and impacts agree with what kinetic energy and gaps say."""
+    saveat = diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 401))
+    run = simulated(FOUR_BAR, start, saveat, formulation=formulation)
+    assert min(run.impacts("wall")[-1], run.impacts("stop")[-1]) >= 2
+    violation = run.worst_violation()
+    assert max(violation.position, violation.velocity) < (1e-9 if formulation == "tangent-space" else 1e-6)
+    np.testing.assert_allclose(run.unaccounted_energy(), 0.0, atol=1e-7 if formulation == "tangent-space" else 1e-4)
+    system = system_of(run.mechanism, run.q.dtype)
+    gaps = jax.vmap(lambda q: jnp.stack([force.gap(configure(system, 0.0, q)) for force in system.forces[1:]]))(run.q)
+    assert -1e-9 < np.min(gaps) < 1e-3
+
+
+@pytest.mark.slow
+def test_derivatives_through_impacts_in_loops(start):
+    """Of the end's state, forwards and backwards, by numbers of the mechanism and by the speed at the start."""
+    direction = start.v / start.v[0]
+
+    def end(x):
+        state = lx.State(start.q, start.v + x[3] * direction)
+        found = simulated(x[:3], state, diffrax.SaveAt(t1=True)).end
+        return jnp.stack([found.q[0], found.v[0] / 10.0])
+
+    x = jnp.concatenate([FOUR_BAR, jnp.zeros(1)])
+    found = jax.jit(jax.jacfwd(end))(x)
+    size = np.max(np.abs(found))
+    np.testing.assert_allclose(found, differences(jax.jit(end), x), atol=1e-6 * size)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(end))(x), found, atol=1e-9 * size)
+
+
+def test_a_ball_that_comes_to_rest_ends_the_run():
+    """Bounces accumulate at a time that the closed form knows; from there there are no derivatives."""
+    restitution, start = 0.5, lx.State(jnp.ones(1), jnp.zeros(1))
+    with pytest.raises(lx.SimulationError, match="comes to rest on the stop") as told:
+        lx.simulate(ball(restitution), start, t1=3.0, accuracy=PRECISE)
+    found = told.value.solution
+    rest = np.sqrt(2.0 / G) * (1.0 + restitution) / (1.0 - restitution)
+    np.testing.assert_allclose(found.t_end, rest, atol=1e-5)
+    assert found.result == lx.RESULTS.rests_on_stop
+    assert found.stats["num_steps"] < 200
+
+
+@pytest.mark.parametrize("coordinate", [0.0, -0.5], ids=["on", "beyond"])
+def test_runs_that_begin_on_a_stop_or_beyond_it(coordinate):
+    start = lx.State(jnp.full(1, coordinate), jnp.zeros(1))
+    run = lx.simulate(ball(0.5), start, t1=1.0, throw=False)
+    assert run.result == lx.RESULTS.rests_on_stop
+    upwards = lx.State(jnp.zeros(1), jnp.ones(1))
+    run = lx.simulate(ball(0.5), upwards, t1=0.1)
+    np.testing.assert_allclose(run.end.q, 0.1 - G * 0.1**2 / 2.0, rtol=1e-9)
+
+
+def test_spheres_swap_speeds():
+    """Two equal spheres on a rail swap speeds."""
+    one, other = lx.point_mass("one", 1.0), lx.point_mass("other", 1.0)
+    rails = [lx.Prismatic(f"{body.name}_rail", lx.GROUND, body, "x") for body in (one, other)]
+    impact = lx.Impact(lx.Sphere(one, 0.1), lx.Sphere(other, 0.2), restitution=1.0, name="hit")
+    run = lx.simulate(
+        lx.Mechanism([one, other], rails, [impact]), lx.State(jnp.array([0.0, 1.0]), jnp.array([1.0, 0.0])), t1=1.0
+    )
+    np.testing.assert_allclose(run.end.v, [0.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(run.end.q, [0.7, 1.3], atol=1e-9)
+    assert run.impacts("hit")[-1] == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "make"),
+    [
+        ("neither lower nor upper", lambda: lx.Impact("a", restitution=0.5)),
+        ("restitution is 1.5", lambda: lx.Impact("a", lower=0.0, restitution=1.5)),
+        ("slowest .* is 0.0", lambda: lx.Impact("a", lower=0.0, restitution=0.5, slowest=0.0)),
+        (
+            "shapes have neither",
+            lambda: lx.Impact(lx.Sphere(lx.GROUND, 1.0), lx.Plane(lx.point_mass("a", 1.0)), restitution=0.5, lower=0.0),
+        ),
+        (
+            "both shapes are on body 'ground'",
+            lambda: lx.Impact(lx.Sphere(lx.GROUND, 1.0), lx.Plane(lx.GROUND), restitution=0.5),
+        ),
+        ("both shapes are planes", lambda: lx.Impact(lx.Plane(lx.GROUND), lx.Plane(lx.GROUND), restitution=0.5)),
+        ("a shape is 'a'", lambda: lx.Impact("a", "b", restitution=0.5)),
+    ],
+    ids=lambda entry: entry if isinstance(entry, str) else "",
+)
+def test_bad_impacts_are_refused(words, make):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_what_impacts_cannot_do_is_said():
+    start = lx.State(jnp.ones(1), jnp.zeros(1))
+    with pytest.raises(ValueError, match="needs steps that end where an impact happens"):
+        lx.simulate(ball(0.5), start, t1=1.0, stepsize_controller=diffrax.ConstantStepSize(), dt0=0.1)
+    here = lx.Solution.of_state(ball(0.5), start)
+    with pytest.raises(ValueError, match="has impulses, and no force"):
+        here.force("floor")
+    with pytest.raises(ValueError, match="without the run"):
+        here.impacts("floor")
+    with pytest.raises(ValueError, match="unknown impact 'wall'; known: 'floor'"):
+        here.impacts("wall")

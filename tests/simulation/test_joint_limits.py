@@ -1,0 +1,119 @@
+"""Stops of joints by a contact law: restitution, energy, derivatives, convergence to the rigid stop."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import linkax as lx
+from linkax.model.contact_law import Friction
+
+SAVE_END = diffrax.SaveAt(t1=True)
+STEP = 1e-3  # of central differences
+SAVES = diffrax.SaveAt(ts=np.linspace(0.0, 0.6, 601))
+
+
+def ball(law, **ends):
+    """A mass on a slide with stops."""
+    mass = lx.point_mass("mass", 0.7)
+    return lx.Mechanism(
+        [mass], [lx.Prismatic("slide", lx.GROUND, mass, "x")], [lx.JointLimit("slide", law, name="stop", **ends)]
+    )
+
+
+@jax.jit
+def thrown(numbers, start):
+    """Coordinate and speed of a mass between two stops after one hit, by (restitution, exponent, stiffness)."""
+    restitution, exponent, stiffness = numbers
+    law = lx.ContactLaw(stiffness, exponent, restitution=restitution, impact_speed=2.0)
+    mechanism = ball(law, lower=-0.3, upper=0.5)
+    accuracy = lx.Accuracy(rtol=1e-10)
+    end = lx.simulate(mechanism, lx.State(start[:1], start[1:]), t1=0.3, accuracy=accuracy, saveat=SAVE_END).end
+    return jnp.concatenate([end.q, end.v])
+
+
+CASES = np.array([[0.9, 1.5, 1e5], [0.4, 1.1, 1e4], [0.1, 2.0, 1e6]])
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_restitution_is_what_was_asked_for(side):
+    """At the speed that it was given for, whatever the stiffness and the exponent; at both ends."""
+    for numbers in CASES:
+        found = thrown(jnp.asarray(numbers), jnp.array([0.1, 2.0 * side]))
+        np.testing.assert_allclose(found[1], -numbers[0] * 2.0 * side, rtol=1e-7)
+
+
+@jax.jit
+def derivatives(x, scale):
+    """Of `thrown`, forwards and backwards."""
+    value = lambda x: thrown(x[:3] * scale, x[3:])
+    return jax.jacfwd(value)(x), jax.jacrev(value)(x)
+
+
+@pytest.mark.parametrize("case", [0, 1])
+def test_derivatives_of_a_hit(case):
+    """Forwards and backwards, against central differences of fourth order."""
+    scale = jnp.asarray([1.0, 1.0, CASES[case, 2]])
+    x = jnp.concatenate([jnp.asarray(CASES[case]) / scale, jnp.array([0.1, 1.9])])
+    forwards, backwards = derivatives(x, scale)
+    value = lambda x: thrown(x[:3] * scale, x[3:])
+    rise = lambda e: value(x + e) - value(x - e)
+    differences = np.stack([(8.0 * rise(e) - rise(2.0 * e)) / (12.0 * STEP) for e in STEP * np.eye(5)], axis=1)
+    size = np.max(np.abs(differences))
+    np.testing.assert_allclose(forwards, differences, atol=1e-6 * size)
+    np.testing.assert_allclose(backwards, forwards, atol=1e-9 * size)
+
+
+def four_bar(cut):
+    """A four-bar with a stop at the joint of its rocker, in the tree or cut."""
+    crank, coupler, rocker = lx.rod("crank", 0.3, 1.0), lx.rod("coupler", 0.7, 1.0), lx.rod("rocker", 0.6, 1.0)
+    joints = [
+        lx.Revolute("A", lx.GROUND, crank.at("base"), "z"),
+        lx.Revolute("B", crank.at("tip"), coupler.at("base"), "z"),
+        lx.Revolute("C", coupler.at("tip"), rocker.at("tip"), "z", cut=not cut),
+        lx.Revolute("D", lx.GROUND.at([0.8, 0.0, 0.0]), rocker.at("base"), "z", cut=cut),
+    ]
+    law = lx.ContactLaw(1e4, damping=0.1)
+    forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointLimit("D", law, lower=1.7, upper=2.1, name="stop")]
+    return lx.Mechanism([crank, coupler, rocker], joints, forces)
+
+
+def test_stops_in_the_tree_and_cut_are_the_same():
+    """The stop of a loop's joint that is cut, which has no coordinate of its own; its energy is accounted for."""
+    found = []
+    for cut in (False, True):
+        mechanism = four_bar(cut)
+        guess = {"B": -0.6} if cut else {"D": 1.9}
+        state = lx.assemble(mechanism, {"A": 0.9}, {"A": 1.0}, guess=guess)
+        run = lx.simulate(mechanism, state, t1=0.6, accuracy=lx.Accuracy(rtol=1e-9), saveat=SAVES)
+        np.testing.assert_allclose(run.unaccounted_energy(), 0.0, atol=2e-4)
+        found.append(np.stack([run.joint("D"), run.force("stop")]))
+    force = found[0][1]
+    assert np.max(force) > 1.0 > -1.0 > np.min(force)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-5 * np.max(np.abs(found[0][1])))
+
+
+@pytest.mark.parametrize(
+    ("words", "make"),
+    [
+        ("restitution None, impact_speed 1.0", lambda: lx.ContactLaw(1.0, impact_speed=1.0)),
+        ("damping is 1.0, restitution 0.5", lambda: lx.ContactLaw(1.0, damping=1.0, restitution=0.5, impact_speed=1.0)),
+        ("restitution is 1.0; it must lie", lambda: lx.ContactLaw(1.0, restitution=1.0, impact_speed=1.0)),
+        ("exponent is 0.5", lambda: lx.ContactLaw(1.0, 0.5)),
+        ("stiffness .* is 0.0", lambda: lx.ContactLaw(0.0)),
+        ("friction is 0.3; give a linkax.Friction", lambda: lx.ContactLaw(1.0, friction=0.3)),
+        ("viscous is 1.0 and viscous_force is None", lambda: Friction(0.1, transition_speed=1.0, viscous=1.0)),
+        ("neither lower nor upper", lambda: lx.JointLimit("a", lx.ContactLaw(1.0))),
+        ("upper must be larger", lambda: lx.JointLimit("a", lx.ContactLaw(1.0), lower=1.0, upper=1.0)),
+        ("law is 1.0; give", lambda: lx.JointLimit("a", 1.0, lower=0.0)),
+        (
+            "its law has friction",
+            lambda: lx.JointLimit("a", lx.ContactLaw(1.0, friction=Friction(0.1, transition_speed=1.0)), lower=0.0),
+        ),
+    ],
+    ids=lambda entry: entry if isinstance(entry, str) else "",
+)
+def test_bad_stops_are_refused(words, make):
+    with pytest.raises(ValueError, match=words):
+        make()
