@@ -62,7 +62,10 @@ from linkax.model.constraints import Coupling as Coupling  # noqa: E402
 from linkax.model.constraints import Drive as Drive  # noqa: E402
 from linkax.model.controllers import FirstOrderSensor as FirstOrderSensor  # noqa: E402
 from linkax.model.controllers import PIDController as PIDController  # noqa: E402
+from linkax.model.contact import Clearance as Clearance  # noqa: E402
+from linkax.model.contact import Contact as Contact  # noqa: E402
 from linkax.model.contact_law import ContactLaw as ContactLaw  # noqa: E402
+from linkax.model.contact_law import Friction as Friction  # noqa: E402
 from linkax.model.curves import PeriodicSpline as PeriodicSpline  # noqa: E402
 from linkax.model.curves import SplineCurve as SplineCurve  # noqa: E402
 from linkax.model.forces import AbstractForce as AbstractForce  # noqa: E402

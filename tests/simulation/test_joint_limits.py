@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import linkax as lx
-from linkax.model.contact_law import Friction
 
 SAVE_END = diffrax.SaveAt(t1=True)
+G, DAMPING = 9.81, 0.02
+ENDS = (8.88, 6.96)  # between the tenth bounce and the eleventh, without loss and with it [s]
 STEP = 1e-3  # of central differences
 SAVES = diffrax.SaveAt(ts=np.linspace(0.0, 0.6, 601))
 
@@ -33,7 +34,7 @@ def thrown(numbers, start):
     return jnp.concatenate([end.q, end.v])
 
 
-CASES = np.array([[0.9, 1.5, 1e5], [0.4, 1.1, 1e4], [0.1, 2.0, 1e6]])
+CASES = np.array([[0.9, 1.5, 1e5], [0.4, 1.0, 1e4], [0.1, 2.0, 1e6]])
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
@@ -51,18 +52,60 @@ def derivatives(x, scale):
     return jax.jacfwd(value)(x), jax.jacrev(value)(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [0, 1])
 def test_derivatives_of_a_hit(case):
-    """Forwards and backwards, against central differences of fourth order."""
+    """Forwards and backwards, against central differences; not by an exponent of one, which cannot be smaller."""
     scale = jnp.asarray([1.0, 1.0, CASES[case, 2]])
     x = jnp.concatenate([jnp.asarray(CASES[case]) / scale, jnp.array([0.1, 1.9])])
     forwards, backwards = derivatives(x, scale)
     value = lambda x: thrown(x[:3] * scale, x[3:])
     rise = lambda e: value(x + e) - value(x - e)
     differences = np.stack([(8.0 * rise(e) - rise(2.0 * e)) / (12.0 * STEP) for e in STEP * np.eye(5)], axis=1)
-    size = np.max(np.abs(differences))
-    np.testing.assert_allclose(forwards, differences, atol=1e-6 * size)
+    taken = [0, 1, 2, 3, 4] if CASES[case, 1] > 1.0 else [0, 2, 3, 4]
+    size = np.max(np.abs(differences[:, taken]))
+    np.testing.assert_allclose(forwards[:, taken], differences[:, taken], atol=1e-6 * size)
     np.testing.assert_allclose(backwards, forwards, atol=1e-9 * size)
+
+
+@jax.jit
+@jax.vmap
+def bounced(stiffness):
+    """Height and speed after ten bounces on a floor from a height of 1 m, without loss and with it."""
+
+    def end(damping, t1):
+        mass = lx.point_mass("mass", 1.0)
+        floor = lx.JointLimit("rail", lx.ContactLaw(stiffness, damping=damping), lower=0.0)
+        rail = lx.Prismatic("rail", lx.GROUND, mass, "y")
+        mechanism = lx.Mechanism([mass], [rail], [lx.Gravity([0.0, -G, 0.0]), floor])
+        start, accuracy = lx.State(jnp.ones(1), jnp.zeros(1)), lx.Accuracy(rtol=1e-9)
+        found = lx.simulate(mechanism, start, t1=t1, accuracy=accuracy, saveat=SAVE_END).end
+        return jnp.stack([found.q[0], found.v[0]])
+
+    return end(0.0, ENDS[0]), end(DAMPING, ENDS[1])
+
+
+def rigid(damping, bounces):
+    """The time of the last one of bounces on a rigid floor, and the speed after it: restitution falls with speed."""
+    speed, t = np.sqrt(2.0 * G), np.sqrt(2.0 / G)
+    for bounce in range(bounces):
+        d, e = damping * speed, 1.0 - 2.0 * damping * speed / 3.0
+        for _ in range(50 if damping else 0):  # (1 + e) d = ln((1 + d) / (1 - e d))
+            e -= ((1.0 + e) * d - np.log((1.0 + d) / (1.0 - e * d))) / (d - d / (1.0 - e * d))
+        speed *= e
+        t += 2.0 * speed / G * (bounce < bounces - 1)
+    return t, speed
+
+
+def test_stiffer_stops_come_nearer_to_a_rigid_one():
+    """By the power 2/5 of the stiffness, the time of a contact, over ten bounces."""
+    stiffness = 1e5 * 2.0 ** (2.5 * np.arange(2, 5))
+    for found, damping, end in zip(bounced(jnp.asarray(stiffness)), (0.0, DAMPING), ENDS, strict=True):
+        t, speed = rigid(damping, 10)
+        exact = np.array([speed * (end - t) - G * (end - t) ** 2 / 2.0, speed - G * (end - t)])
+        error = np.abs(np.asarray(found) - exact)
+        np.testing.assert_allclose(np.log2(error[-2] / error[-1]), 1.0, atol=0.1)
+        assert error[-1, 1] < 10.0 * G * 3.0 * stiffness[-1] ** -0.4
 
 
 def four_bar(cut):
@@ -79,6 +122,7 @@ def four_bar(cut):
     return lx.Mechanism([crank, coupler, rocker], joints, forces)
 
 
+@pytest.mark.slow
 def test_stops_in_the_tree_and_cut_are_the_same():
     """The stop of a loop's joint that is cut, which has no coordinate of its own; its energy is accounted for."""
     found = []
@@ -103,13 +147,13 @@ def test_stops_in_the_tree_and_cut_are_the_same():
         ("exponent is 0.5", lambda: lx.ContactLaw(1.0, 0.5)),
         ("stiffness .* is 0.0", lambda: lx.ContactLaw(0.0)),
         ("friction is 0.3; give a linkax.Friction", lambda: lx.ContactLaw(1.0, friction=0.3)),
-        ("viscous is 1.0 and viscous_force is None", lambda: Friction(0.1, transition_speed=1.0, viscous=1.0)),
+        ("viscous is 1.0 and viscous_force is None", lambda: lx.Friction(0.1, transition_speed=1.0, viscous=1.0)),
         ("neither lower nor upper", lambda: lx.JointLimit("a", lx.ContactLaw(1.0))),
         ("upper must be larger", lambda: lx.JointLimit("a", lx.ContactLaw(1.0), lower=1.0, upper=1.0)),
         ("law is 1.0; give", lambda: lx.JointLimit("a", 1.0, lower=0.0)),
         (
             "its law has friction",
-            lambda: lx.JointLimit("a", lx.ContactLaw(1.0, friction=Friction(0.1, transition_speed=1.0)), lower=0.0),
+            lambda: lx.JointLimit("a", lx.ContactLaw(1.0, friction=lx.Friction(0.1, transition_speed=1.0)), lower=0.0),
         ),
     ],
     ids=lambda entry: entry if isinstance(entry, str) else "",

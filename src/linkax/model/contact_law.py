@@ -62,13 +62,13 @@ class Friction(eqx.Module):
         self.viscous = zero_or_more(0.0 if viscous is None else viscous, "Friction: viscous [N s/m]")
         self.viscous_force = positive(1.0 if viscous_force is None else viscous_force, "Friction: viscous_force [N]")
 
-    def force(self, normal: Scalar, sliding: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    def force(self, normal: Scalar, sliding: Float[Array, "3"]) -> Float[jax.Array, "3"]:
         """Compute the friction [N] on what slides at a velocity [m/s] under a normal force [N]."""
         square = dot(sliding, sliding) / self.transition_speed**2
         dry = self.dynamic * 4.0 * _tanh_ratio(16.0 * square)
         dry = dry + (self.static - self.dynamic) / (square / 4.0 + 0.75) ** 2
         viscous = self.viscous * jnp.tanh(4.0 * normal / self.viscous_force)
-        return -jnp.asarray(normal * dry / self.transition_speed + viscous)[..., None] * sliding
+        return -(normal * dry / self.transition_speed + viscous) * sliding
 
 
 def _tanh_ratio(square: Any) -> Any:
@@ -97,9 +97,10 @@ class ContactLaw(eqx.Module):
     restitution differs: with the same damping slow impacts lose less, as those of metals do.
 
     A contact lasts for about 3 (m / stiffness)^(2/5) v₀^(−1/5) with exponent 3/2, m the mass that meets it, and takes
-    some 30 steps. Compared with a rigid stop results are off by about this time: halved by a stiffness 5.7 times as
-    large. Where stops are hit rarely, `linkax.Impact` is exact and takes a step or two for an impact. Where many bodies
-    touch at once, are stacked, or stick, take a simulator made for that, such as MuJoCo.
+    some 30 steps. It delays the motion by about this time, compared with a rigid stop of the same restitution: results
+    are off in proportion to stiffness^(−2/5), half as far with one 5.7 times as large. Ten bounces from 1 m, of 1 kg on
+    1e7 N/m^(3/2), end 0.04 s late. Where stops are hit rarely, `linkax.Impact` is exact and takes a step or two for an
+    impact. Where many bodies touch at once, are stacked, or stick, take a simulator made for that, such as MuJoCo.
 
     **Arguments:**
 
