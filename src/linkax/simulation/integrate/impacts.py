@@ -47,10 +47,9 @@ def _record_begins(mechanism):
     return sum(map(has_switch, mechanism.forces))
 
 
-def at_rest(system: System, kept: Float[Array, " kept"] | tuple[()]) -> Bool[Array, ""] | bool:
-    """Whether the motion rests on a stop, by what y keeps of switches, or all of y."""
-    stops = places(system)
-    return jnp.any(kept[stops] < 0.0) if len(stops) and len(kept) else False
+def at_rest(system: System, kept: Float[Array, " kept"]) -> Bool[Array, ""]:
+    """Whether the motion of a system with impacts rests on a stop, by what y keeps of switches."""
+    return jnp.any(kept[places(system)] < 0.0)
 
 
 def struck(problem: Problem, t: Float[Array, ""], y: Float[Array, " n"], index: Int[Array, ""]) -> Float[Array, " n"]:

@@ -17,7 +17,7 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.discrete_adjoint import Integrated, Integrator, integrate, solve_by_diffrax
-from linkax.simulation.integrate.impacts import at_rest
+from linkax.simulation.integrate.impacts import at_rest, impacts_of
 from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.options import saved_times
 from linkax.simulation.integrate.problem import Problem
@@ -109,7 +109,7 @@ def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     saved = saveat.subs.ts if run.has_discrete_adjoint else None
     solve = integrate if run.has_discrete_adjoint else solve_by_diffrax
     integrated, _ = solve(InitialValueProblem(problem, y0, t0, t1, saved), integrator, False)
-    rests = at_rest(problem.system, problem.sides(integrated.y_end))
+    rests = impacts_of(problem.system) and at_rest(problem.system, problem.sides(integrated.y_end))
     result = _result(integrated.result, initial, in_order, control.is_adaptive, rests)
     integrated = integrated._replace(result=result)
     return _without_derivatives(integrated, event, inputs)
@@ -160,10 +160,11 @@ def _wrapped_event(event):
     return eqx.tree_at(lambda e: e.cond_fn, event, jax.tree.map(_OnManifold, event.cond_fn, is_leaf=callable))
 
 
-def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptive: bool, rests: Bool[Array, ""] | bool):
+def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptive: bool, rests: Any):
     """The first of what is wrong at the start, else how the integration ended."""
     result = RESULTS.promote(result)
-    result = RESULTS.where(rests & (result == RESULTS.dt_min_reached), RESULTS.rests_on_stop, result)
+    if isinstance(rests, jax.Array):
+        result = RESULTS.where(rests & (result == RESULTS.dt_min_reached), RESULTS.rests_on_stop, result)
     if not is_adaptive:
         result = RESULTS.where(result == RESULTS.dt_min_reached, RESULTS.diverged, result)
     result = RESULTS.where(initial.unique, result, RESULTS.not_unique)

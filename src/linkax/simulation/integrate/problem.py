@@ -18,7 +18,7 @@ from linkax.model.internal_states import scales
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack
-from linkax.simulation.integrate.impacts import at_rest
+from linkax.simulation.integrate.impacts import at_rest, impacts_of
 from linkax.simulation.integrate.switches import Sides, held, values
 from linkax.simulation.start.state import State
 from linkax.straight_line.transform import straight_line
@@ -88,7 +88,9 @@ class Problem(eqx.Module):
 
     def can_go_on(self, y: Float[Array, " n"]) -> Bool[Array, ""] | bool:
         """Whether a step may be taken from a vector."""
-        return self.can_start & jnp.logical_not(at_rest(self.system, self.sides(y)))
+        if not impacts_of(self.system):
+            return self.can_start
+        return self.can_start & jnp.logical_not(at_rest(self.system, jnp.asarray(self.sides(y))))
 
     def switches(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " m"]:
         """Values of the switches at a vector, (m,)."""

@@ -134,7 +134,7 @@ def tangents_over_steps(
 ) -> Trajectory:
     """JVP of a run, step by step from the first: tangents of its states; None among `tangents` is zero."""
     y0, count = ivp.y0, cast(Any, steps.count)
-    last = count - 1
+    last, switching = count - 1, len(ivp.problem.sides(ivp.y0)) > 0
     saves, saved = ivp.saved is not None, cast(Any, ivp.saved)
     saved_dot = cast(Any, materialise(saved, tangents.saved) if saves else None)
 
@@ -144,12 +144,12 @@ def tangents_over_steps(
     def one(carry):
         k, j, y, moves, motion = carry
         ends = steps.ts[k], steps.ts[k + 1]
-        begin_dot = jnp.where(k == 0, materialise(ivp.t0, tangents.t0), moves)
-        end_dot = jnp.where(k == last, materialise(ivp.t1, tangents.t1), moves)
+        begin_dot = jnp.where(k == 0, materialise(ivp.t0, tangents.t0), moves if switching else 0.0)
+        end_dot = jnp.where(k == last, materialise(ivp.t1, tangents.t1), moves if switching else 0.0)
         moved = tangents.problem, begin_dot, end_dot, motion.end
         sides = ivp.problem.sides(steps.ys[k + 1])
         at = ivp.problem, *ends, y
-        ((_, y), dense), ((moves, y_dot), dense_dot) = eqx.filter_jvp(functools.partial(step, sides), at, moved)
+        ((_, y), dense), ((later, y_dot), dense_dot) = eqx.filter_jvp(functools.partial(step, sides), at, moved)
 
         def save(carry):
             j, found = carry
@@ -161,7 +161,8 @@ def tangents_over_steps(
         if saves:
             j, found = lax.while_loop(lambda carry: _reached(saved, carry[0], ends[1]), save, (j, found))
         each = lambda rows, row: rows.at[k + 1].set(row) if every else None
-        return k + 1, j, y, moves, Trajectory(found, y_dot, each(motion.steps, y_dot), each(motion.times, moves))
+        times = each(motion.times, later) if switching else motion.times
+        return k + 1, j, y, later if switching else None, Trajectory(found, y_dot, each(motion.steps, y_dot), times)
 
     motion = Trajectory(
         saved=jnp.zeros((len(saved), len(y0)), y0.dtype) if saves else None,
@@ -169,7 +170,7 @@ def tangents_over_steps(
         steps=jnp.zeros_like(steps.ys).at[0].set(materialise(y0, tangents.y0)) if every else None,
         times=jnp.zeros_like(steps.ts).at[0].set(materialise(ivp.t0, tangents.t0)) if every else None,
     )
-    begin = jnp.zeros((), int), jnp.zeros((), int), y0, jnp.zeros_like(ivp.t0), motion
+    begin = jnp.zeros((), int), jnp.zeros((), int), y0, jnp.zeros_like(ivp.t0) if switching else None, motion
     return lax.while_loop(lambda carry: carry[0] < count, one, begin)[-1]
 
 
@@ -183,7 +184,7 @@ def cotangents_over_steps(
 ) -> InitialValueProblem:
     """VJP of a run, step by step from the last: cotangents of the leaves of `ivp` that are `wanted`."""
     problem, fixed = eqx.partition(ivp.problem, wanted.problem)
-    last = cast(Any, steps.count) - 1
+    last, switching = cast(Any, steps.count) - 1, len(ivp.problem.sides(ivp.y0)) > 0
     saved = cast(Any, ivp.saved)
     saved_cotangent: Any = cotangent.saved
 
@@ -200,20 +201,29 @@ def cotangents_over_steps(
         j, begin_bar, end_bar, dense_bar, saved_bar = of_step
         sides = ivp.problem.sides(steps.ys[k + 1])
         more, begin_more, end_more, y_bar = _step_vjp(
-            solver, of_problem, problem, *ends, dense, sides, (moves_bar, y_bar), dense_bar
+            solver, of_problem, problem, *ends, dense, sides, (moves_bar if switching else zero, y_bar), dense_bar
         )
         problem_bar = jax.tree.map(jnp.add, problem_bar, more)
         begin_bar, end_bar = begin_bar + begin_more, end_bar + end_more
         t0_bar = jnp.where(k == 0, begin_bar, t0_bar)
         t1_bar = jnp.where(k == last, end_bar, t1_bar)
-        moves_bar = begin_bar + jnp.where(k == last, 0.0, end_bar)
+        moves_bar = begin_bar + jnp.where(k == last, 0.0, end_bar) if switching else None
         return k - 1, j, y_bar, moves_bar, problem_bar, t0_bar, t1_bar, saved_bar
 
     zero = jnp.zeros((), steps.ts.dtype)
     finish = steps.ts[steps.count]
     count = 0 if saved is None else jnp.sum(saved <= finish)
     saved_bar = None if saved is None else jnp.zeros_like(saved)
-    begin = last, count - 1, cotangent.end, zero, jax.tree.map(jnp.zeros_like, problem), zero, zero, saved_bar
+    begin = (
+        last,
+        count - 1,
+        cotangent.end,
+        zero if switching else None,
+        jax.tree.map(jnp.zeros_like, problem),
+        zero,
+        zero,
+        saved_bar,
+    )
     *_, y_bar, _, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(lambda carry: carry[0] >= 0, one, begin)
     return eqx.filter(InitialValueProblem(problem_bar, y_bar, t0_bar, t1_bar, saved_bar), wanted)
 
