@@ -60,12 +60,12 @@ from linkax.model.bodies import point_mass as point_mass  # noqa: E402
 from linkax.model.constraints import AbstractConstraint as AbstractConstraint  # noqa: E402
 from linkax.model.constraints import Coupling as Coupling  # noqa: E402
 from linkax.model.constraints import Drive as Drive  # noqa: E402
-from linkax.model.controllers import FirstOrderSensor as FirstOrderSensor  # noqa: E402
-from linkax.model.controllers import PIDController as PIDController  # noqa: E402
 from linkax.model.contact import Clearance as Clearance  # noqa: E402
 from linkax.model.contact import Contact as Contact  # noqa: E402
 from linkax.model.contact_law import ContactLaw as ContactLaw  # noqa: E402
 from linkax.model.contact_law import Friction as Friction  # noqa: E402
+from linkax.model.controllers import FirstOrderSensor as FirstOrderSensor  # noqa: E402
+from linkax.model.controllers import PIDController as PIDController  # noqa: E402
 from linkax.model.curves import PeriodicSpline as PeriodicSpline  # noqa: E402
 from linkax.model.curves import SplineCurve as SplineCurve  # noqa: E402
 from linkax.model.forces import AbstractForce as AbstractForce  # noqa: E402
@@ -75,8 +75,8 @@ from linkax.model.gears import Gear as Gear  # noqa: E402
 from linkax.model.gears import Rack as Rack  # noqa: E402
 from linkax.model.guides import PointOnSurface as PointOnSurface  # noqa: E402
 from linkax.model.guides import Prescribed as Prescribed  # noqa: E402
-from linkax.model.internal_states import InternalState as InternalState  # noqa: E402
 from linkax.model.impacts import Impact as Impact  # noqa: E402
+from linkax.model.internal_states import InternalState as InternalState  # noqa: E402
 from linkax.model.joint_forces import JointDamper as JointDamper  # noqa: E402
 from linkax.model.joint_forces import JointFriction as JointFriction  # noqa: E402
 from linkax.model.joint_forces import JointSpring as JointSpring  # noqa: E402

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from linkax.model.contact_law import ContactLaw
 from linkax.model.elements import Configuration, Motion
-from linkax.model.joint_forces import _AlongJoint
+from linkax.model.joint_forces import AlongJoint
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, number, numbers_of, require, require_type
 from linkax.model.terms import Term, TermLike, term
@@ -67,7 +67,7 @@ class JointRange(eqx.Module):
         return jnp.ones((), system.dtype) if is_angle else system.length
 
 
-class JointLimit(_AlongJoint):
+class JointLimit(AlongJoint):
     """A stop at one end, or at both ends, of the range of a joint's coordinate, which pushes it back by a contact law.
 
     Steps end where the stop is met and where it is left. What smoothing a rigid stop costs, and when to take
