@@ -84,3 +84,82 @@ def test_derivatives():
     ).q[0, 0]
     exact = 9.81 * 0.1 / (2.0 * (0.09 + 0.015) ** 2) * 2.0 * 0.3
     np.testing.assert_allclose([jax.grad(reached)(0.3), jax.jacfwd(reached)(0.3)], exact, rtol=1e-9)
+
+
+class BallOnCircle(lx.AbstractJoint):
+    """A ball whose centre stays on a circle, and that turns freely: a quaternion and an angle."""
+
+    speed_units = ("rad", "rad", "rad", "rad")
+    has_quaternion = True
+
+    radius: float
+
+    def __init__(self, name, parent, child, radius, *, cut=False):
+        super().__init__(name, parent, child, "x", cut=cut)
+        self.radius = radius
+
+    def transform(self, coordinates):
+        w, x, y, z, angle = coordinates
+        turned = jnp.array(
+            [
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+                [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+                [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+            ]
+        )
+        return turned, self.radius * jnp.stack([jnp.cos(angle), 0.0 * angle, jnp.sin(angle)])
+
+
+def test_coordinates_that_are_a_quaternion():
+    """Off its centre of mass, as a ball on a massless arm from a hinge: two models of one motion."""
+    top = lambda: lx.RigidBody("top", 2.0, [0.05, 0.02, 0.1], [0.02, 0.03, 0.04])
+    own = lx.Mechanism([top()], [BallOnCircle("slot", lx.GROUND, top(), 0.3)], [lx.Gravity([0.0, 0.0, -9.81])])
+    arm = lx.RigidBody("arm", 0.0)
+    joints = [
+        lx.Revolute("hinge", lx.GROUND, arm, "-y"),
+        lx.Spherical("ball", arm.at([0.3, 0.0, 0.0]), top()),
+    ]
+    other = lx.Mechanism([arm, top()], joints, [lx.Gravity([0.0, 0.0, -9.81])])
+    omega = jnp.array([0.4, -1.1, 2.0])
+    begin = lx.State(jnp.array([1.0, 0.0, 0.0, 0.0, -0.4]), jnp.array([*omega, 0.7]))
+    found = lx.simulate(own, begin, t1=1.0, accuracy=lx.PRECISE)
+    begin = lx.assemble(
+        other,
+        {"hinge": -0.4, "top": lx.Pose(found.position("top", [0.0, 0.0, 0.0])[0], np.eye(3))},
+        {"hinge": 0.7, "top": lx.Velocity(angular=omega)},
+    )
+    expected = lx.simulate(other, begin, t1=1.0, accuracy=lx.PRECISE)
+    np.testing.assert_allclose(found.position("top"), expected.position("top"), atol=1e-8)
+    np.testing.assert_allclose(found.orientation("top"), expected.orientation("top"), atol=1e-8)
+    np.testing.assert_allclose(found.reaction("slot").force, expected.reaction("ball").force, atol=1e-6)
+
+
+class Mistaken(lx.AbstractJoint):
+    speed_units = ("m",)
+    mistake: str = eqx.field(static=True)
+
+    def __init__(self, mistake):
+        super().__init__("wire", lx.GROUND, lx.point_mass("bead", 1.0), "x")
+        self.mistake = mistake
+
+    def transform(self, coordinates):
+        match self.mistake:
+            case "shape":
+                return jnp.eye(3), coordinates
+            case "axes":
+                return 2.0 * jnp.eye(3), jnp.zeros(3)
+            case "name":
+                return jnp.eye(3), self.radius * jnp.ones(3)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "told"),
+    [
+        ("shape", r"joint 'wire': its transform returns shapes \(\(3, 3\), \(1,\)\)"),
+        ("axes", "joint 'wire': its transform returns axes .* are not orthonormal"),
+        ("name", "joint 'wire': its transform raises AttributeError"),
+    ],
+)
+def test_mistakes_are_named(mistake, told):
+    with pytest.raises(ValueError, match=told):
+        lx.Mechanism([lx.point_mass("bead", 1.0)], [Mistaken(mistake)])

@@ -65,9 +65,18 @@ def rates(topology: Topology, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) 
     if not len(topology.quaternions):
         return v
     in_q, in_v = _places(topology)
-    omega = v[in_v]
-    turning = 0.5 * multiply(jnp.concatenate([jnp.zeros_like(omega[:, :1]), omega], axis=-1), q[in_q])
-    return scatter_static(_of_plain(topology, v), in_q, turning)
+    return scatter_static(_of_plain(topology, v), in_q, _quaternion_rates(q[in_q], v[in_v]))
+
+
+def joint_rates(has_quaternion: bool, q: Float[Array, " n"], v: Float[Array, " k"]) -> Float[Array, " n"]:
+    """Rates of one joint's coordinates at its speeds."""
+    if not has_quaternion:
+        return v
+    return jnp.concatenate([_quaternion_rates(q[:4], v[:3]), v[3:]])
+
+
+def _quaternion_rates(quaternion, omega):
+    return 0.5 * multiply(jnp.concatenate([jnp.zeros_like(omega[..., :1]), omega], axis=-1), quaternion)
 
 
 def speeds(topology: Topology, q: Float[Array, " n_q"], rates: Float[Array, " n_q"]) -> Float[Array, " n_v"]:

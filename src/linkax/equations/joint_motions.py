@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from linkax.equations.coordinates import coordinates_by_speed
+from linkax.equations.coordinates import coordinates_by_speed, joint_rates
 from linkax.equations.system import System
 from linkax.equations.tree_sums import expand_to_motions, sum_by_body
 from linkax.model.joints.joint import RelativeMotion
@@ -41,7 +41,8 @@ def joint_motions(
         turns.append(turn)
         order += kind.bodies
     for kind, (turn, away, *subspace) in over_bending(_bent, system, lambda kind: (q[kind.coordinates],)):
-        motions, count = _motions_of(topology, kind), kind.coordinates.shape[1]
+        motions = _motions_of(topology, kind)
+        count = len(motions) // len(kind.bodies)
         angular, linear = (
             scatter_static(whole, motions, part[:, :count])
             for whole, part in zip((angular, linear), subspace, strict=True)
@@ -71,7 +72,7 @@ def over_bending(
     for motion, members in alike.items():
         most = max(kind.coordinates.shape[1] for kind, _ in members)
         arrays = [
-            (*(jnp.pad(array, ((0, 0), (0, most - array.shape[1]))) for array in read(kind)), numbers)
+            (*(jnp.pad(array, ((0, 0), (0, most - kind.coordinates.shape[1]))) for array in read(kind)), numbers)
             for kind, numbers in members
         ]
         together = (array[0] if len(members) == 1 else jnp.concatenate(array) for array in zip(*arrays, strict=True))
@@ -91,8 +92,10 @@ def _motions_of(topology, kind):
 @whole_jacobian
 def _bent(motion, coordinates, numbers):
     """Rotation and translation of a `RelativeMotion`, and its motion subspace, angular and linear, (n, 3) each."""
-    follow = lambda change: jax.jvp(lambda q: motion(q, numbers), (coordinates,), (change,))
-    at, changes = jax.vmap(follow, out_axes=(None, 0))(jnp.eye(len(coordinates), dtype=coordinates.dtype))
+    change = lambda v: joint_rates(motion.has_quaternion, coordinates, v)
+    follow = lambda v: jax.jvp(lambda q: motion(q, numbers), (coordinates,), (change(v),))
+    speeds = jnp.eye(len(coordinates) - motion.has_quaternion, dtype=coordinates.dtype)
+    at, changes = jax.vmap(follow, out_axes=(None, 0))(speeds)
     return at[:3, :3], at[:3, 3], turn_rate(changes[:, :3, :3], at[:3, :3]), changes[:, :3, 3]
 
 

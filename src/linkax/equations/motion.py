@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from linkax.equations.configuration import Configuration
+from linkax.equations.coordinates import joint_rates
 from linkax.equations.joint_motions import over_bending
 from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, expand_to_motions, sum_by_body
@@ -182,7 +183,8 @@ def _turning(kind, coordinates, speeds):
 def _bending(motion, coordinates, speeds, numbers):
     """Angular and linear acceleration of a `RelativeMotion` at constant speeds."""
     place = lambda coordinates: motion(coordinates, numbers)
-    rate = lambda coordinates: jax.jvp(place, (coordinates,), (speeds,))[1]
-    at, accelerations = place(coordinates), jax.jvp(rate, (coordinates,), (speeds,))[1]
+    change = lambda coordinates: joint_rates(motion.has_quaternion, coordinates, speeds)
+    rate = lambda coordinates: jax.jvp(place, (coordinates,), (change(coordinates),))[1]
+    at, accelerations = place(coordinates), jax.jvp(rate, (coordinates,), (change(coordinates),))[1]
     # The symmetric part of R̈ Rᵀ is ω × (ω × …).
     return turn_rate(accelerations[:3, :3], at[:3, :3]), accelerations[:3, 3]

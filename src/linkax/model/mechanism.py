@@ -234,6 +234,8 @@ def _check_references(
 
     for joint in joints.values():
         check_frames(f"joint {joint.name!r}", (joint.parent, joint.child))
+        if not type(joint).__module__.startswith("linkax."):
+            joint.check_transform()
     for force in forces:
         check_frames(force.display_name, force.frames)
         for name, index in force.terms:

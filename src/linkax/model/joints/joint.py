@@ -11,16 +11,26 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
+from linkax.model.elements import ENDED
+from linkax.model.functions import raised
 from linkax.model.numbers import Axis, Constant, perpendicular_axes, require_bool, unit_axis, value
 from linkax.model.terms import Term
 from linkax.spatial.rotations import frame_about_axis
 from linkax.spatial.vectors import length
 from linkax.xla.arrays import Array, ScalarLike
+from linkax.xla.tracing import concrete
+
+ORTHONORMAL = 1e-8  # up to which axes count as such
 
 
 @dataclasses.dataclass(frozen=True)
 class RelativeMotion(abc.ABC):
     """The motion of a joint in the tree, as a pure function that JAX differentiates."""
+
+    @property
+    def has_quaternion(self) -> bool:
+        """Whether its coordinates begin with a unit quaternion, see `AbstractJoint`."""
+        return False
 
     @abc.abstractmethod
     def __call__(self, coordinates: Float[Array, " n"], parameters: Float[Array, " k"]) -> Float[jax.Array, "4 4"]:
@@ -41,7 +51,6 @@ class JointKind:
     motion: RelativeMotion
     speed_units: tuple[str, ...]
 
-    has_quaternion: ClassVar[bool] = False
     is_screw: ClassVar[bool] = False
     # Never cut, so without rows.
     combined_rotations: ClassVar[tuple[tuple[int, int], ...]] = ()
@@ -51,6 +60,11 @@ class JointKind:
     def __name__(self) -> str:
         """Its name, as of a class."""
         return self.name
+
+    @property
+    def has_quaternion(self) -> bool:
+        """Whether its coordinates begin with a unit quaternion."""
+        return self.motion.has_quaternion
 
 
 class AbstractJoint(eqx.Module):
@@ -121,7 +135,8 @@ class AbstractJoint(eqx.Module):
     def transform(self, coordinates: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
         """Compute the child's frame in the parent's at coordinates [rad or m], twice differentiable by JAX.
 
-        It may read the fields of its own class.
+        It may read the fields of its own class. With `has_quaternion` the first four coordinates are a unit quaternion
+        (w, x, y, z), and the first three speeds its angular velocity in joint axes of the parent.
 
         **Returns:** its axes as columns, (3, 3), and its origin [m], (3,), both in joint axes of the parent.
         """
@@ -149,7 +164,35 @@ class AbstractJoint(eqx.Module):
     @property
     def length_estimate(self) -> ScalarLike:
         """Estimate of how far it takes the child from the parent [m]; by default at coordinates of one."""
-        return length(self.transform(jnp.ones(self.num_coordinates))[1])
+        return length(self.transform(self._at_one())[1])
+
+    def check_transform(self) -> None:
+        """Evaluate the transform.
+
+        **Raises:** `ValueError` for one that raises, has another shape, or axes that are not orthonormal.
+        """
+        what, at = f"joint {self.name!r}", self._at_one()
+        try:
+            rotation, position = self.transform(at)
+            shapes = jnp.shape(rotation), jnp.shape(position)
+        except ENDED as error:
+            if isinstance(error, ValueError) and str(error).startswith(what):
+                raise
+            raise ValueError(f"{what}: its transform raises {raised(error, self.transform, (at,))}") from error
+        if shapes != ((3, 3), (3,)):
+            raise ValueError(f"{what}: its transform returns shapes {shapes}; give axes (3, 3) and an origin (3,)")
+        known = concrete(rotation)
+        if known is not None and not np.allclose(known.T @ known, np.eye(3), atol=ORTHONORMAL):
+            raise ValueError(
+                f"{what}: its transform returns axes {known.tolist()} at coordinates {np.asarray(at).tolist()}, which "
+                "are not orthonormal; give those of a rotation, as columns"
+            )
+
+    def _at_one(self):
+        """Coordinates of one, a quaternion of length one."""
+        return jnp.concatenate([jnp.full(4, 0.5)[: 4 * self.has_quaternion], jnp.ones(self.num_coordinates)])[
+            : self.num_coordinates
+        ]
 
     def frames(self) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Return h¹, h², h³ as columns, in the parent's and in the child's body axes."""
@@ -186,6 +229,10 @@ class Transform(RelativeMotion):
     structure: Any
     fixed: tuple[Any, ...]
     shapes: tuple[tuple[int, ...] | None, ...]
+
+    @property
+    def has_quaternion(self) -> bool:
+        return self.of_type.has_quaternion
 
     @staticmethod
     def of(joint: AbstractJoint) -> "Transform":
