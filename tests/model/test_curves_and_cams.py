@@ -112,6 +112,7 @@ def test_a_roller_on_an_eccentric():
     np.testing.assert_allclose(found.joint("guide"), lift, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_homokinetic_joint():
     """Two shafts at an angle turn alike, where a Cardan joint's second one would not."""
     tilt = np.array([[np.cos(0.5), 0.0, np.sin(0.5)], [0.0, 1.0, 0.0], [-np.sin(0.5), 0.0, np.cos(0.5)]])

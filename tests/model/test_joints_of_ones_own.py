@@ -110,6 +110,7 @@ class BallOnCircle(lx.AbstractJoint):
         return turned, self.radius * jnp.stack([jnp.cos(angle), 0.0 * angle, jnp.sin(angle)])
 
 
+@pytest.mark.slow
 def test_coordinates_that_are_a_quaternion():
     """Off its centre of mass, as a ball on a massless arm from a hinge: two models of one motion."""
     top = lambda: lx.RigidBody("top", 2.0, [0.05, 0.02, 0.1], [0.02, 0.03, 0.04])

@@ -144,7 +144,7 @@ class Wrong(lx.AbstractConstraint):
 @pytest.mark.parametrize(
     ("mistake", "told"),
     [
-        ("time", "wrong 'wire': its residual reads t; say `is_driven = True`"),
+        ("time", "wrong 'wire': its residual or slip reads t; say `is_driven = True`"),
         ("shape", r"residual has shape \(3,\), and units \('m',\) are 1"),
         ("body", "unknown body of wrong 'wire' 'table'; known: 'bead'"),
         ("joint", "unknown joint of wrong 'wire' 'hinge'; known: none"),

@@ -54,6 +54,7 @@ def shaken(height):
     return lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0, saveat=diffrax.SaveAt(ts=jnp.asarray(TS)))
 
 
+@pytest.mark.slow
 def test_a_prescribed_pose():
     """Force m (a − g) of the centre of mass, moment about the point; and the work of the shaker is the energy."""
     found = shaken(jnp.array(0.3))

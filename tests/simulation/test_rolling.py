@@ -114,6 +114,7 @@ def turntable(speed):
     return mechanism, lx.assemble(mechanism, {"ball": lx.Pose([1.0, 0.0, 0.1], np.eye(3))}, speeds)
 
 
+@pytest.mark.slow
 def test_a_ball_on_a_turntable():
     mechanism, state = turntable(jnp.array(4.0))
     found = run(mechanism, state)
@@ -130,6 +131,7 @@ def glided(apart):
     return run(mechanism, state).q[-1, 1]
 
 
+@pytest.mark.slow
 def test_derivatives():
     at, step = 0.2, 1e-5
     central = (glided(jnp.array(at + step)) - glided(jnp.array(at - step))) / (2.0 * step)
