@@ -62,7 +62,18 @@ INTERNAL = {
 }
 INTERNAL |= {"fastest_frequency", "nodes", "sections", "section_name", "needs_coordinate", "display_name"}
 INTERNAL |= {"conserves_energy", "switched", "side", "applied", "held"}
-INTERNAL |= {"checked_residual", "check_residual", "checked_slip", "num_rows", "row_scales", "pose", "coordinate"}
+INTERNAL |= {
+    "checked_residual",
+    "check_residual",
+    "checked_slip",
+    "num_rows",
+    "attached",
+    "moving",
+    "still",
+    "row_scales",
+    "pose",
+    "coordinate",
+}
 
 
 def described(name):

@@ -8,7 +8,6 @@ import pytest
 from compilations import compilations
 
 import linkax as lx
-from linkax.model.attached import Attached
 
 HINGE = ("hinge", lx.GROUND)
 
@@ -101,7 +100,7 @@ def test_another_constant_speed_compiles_nothing():
 def test_a_drive_at_constant_speed_goes_on_or_is_held(moves):
     drive = lx.Drive("motor", "hinge", speed=6.0, start=0.3)
     held = drive.held(0.2, jnp.asarray(moves))
-    at_zero = Attached({}, {"hinge": jnp.zeros(1)}, ())
+    at_zero = drive.attached({}, {"hinge": jnp.zeros(1)}, ())
     np.testing.assert_allclose(held.residual(1.0, at_zero), -6.3 if moves else -1.5, rtol=1e-15)
     np.testing.assert_allclose(drive.held(0.2).residual(1.0, at_zero), -1.5, rtol=1e-15)
 

@@ -5,7 +5,7 @@ wrenches of its multipliers, by virtual power; those of a slip are cotangents of
 constraints, first the residuals of each, then its slips.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,9 @@ from linkax.equations.configuration import Configuration, along_speeds
 from linkax.equations.coordinates import rates
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
-from linkax.model.attached import Attached, BodyPose, Moving, Twist
+from linkax.model.attached import Attached, BodyPose, Twist
 from linkax.model.constraints import AbstractConstraint
 from linkax.model.forces import Load
-from linkax.model.names import ByName
 from linkax.spatial.vectors import cross
 from linkax.xla.arrays import Array, ScalarLike
 
@@ -66,7 +65,7 @@ def constraint_rate(configuration: Configuration) -> Float[Array, " k"]:
     def of(constraint):
         attached = _attached(configuration, constraint)
         found = jax.jvp(lambda t: -constraint.checked_residual(t, attached), (t,), (jnp.ones_like(t),))[1]
-        return jnp.concatenate([found, -constraint.checked_slip(t, _still(attached))])
+        return jnp.concatenate([found, -constraint.checked_slip(t, attached.still())])
 
     return _of_driven(system, of)
 
@@ -102,26 +101,7 @@ def _reads(configuration, constraint, poses, q) -> Attached:
     topology = configuration.system.topology
     joints = {name: q[topology.coordinates[name]] for name in constraint.joints}
     turning = tuple(name for name in joints if topology.joint_types[topology.joints.index(name)].has_quaternion)
-    return Attached(ByName(poses, _what("body", constraint)), ByName(joints, _what("joint", constraint)), turning)
-
-
-def _what(kind, constraint):
-    return f"{kind} of {constraint.display_name}"
-
-
-def _moving(attached: Attached, twists: Mapping[str, Twist], speeds: Mapping[str, Array]) -> Moving:
-    """What the slip of a constraint reads."""
-    return Moving(attached.poses, attached.coordinates, attached.quaternions, twists, speeds)
-
-
-def _still(attached: Attached) -> Moving:
-    """The same at rest."""
-    none = {name: jnp.zeros_like(pose.position) for name, pose in attached.poses.items()}
-    twists = {name: Twist(zero, zero) for name, zero in none.items()}
-    counted = {name: entries[int(name in attached.quaternions) :] for name, entries in attached.coordinates.items()}
-    speeds = {name: jnp.zeros_like(entries) for name, entries in counted.items()}
-    named = lambda entries, like: ByName(entries, like.what)
-    return _moving(attached, named(twists, attached.poses), named(speeds, attached.coordinates))
+    return constraint.attached(poses, joints, turning)
 
 
 def _load(configuration: Configuration, constraint: AbstractConstraint) -> Callable[[Array], Load]:
@@ -130,8 +110,8 @@ def _load(configuration: Configuration, constraint: AbstractConstraint) -> Calla
     topology = system.topology
     attached = _attached(configuration, constraint)
     _, of_residual = jax.vjp(lambda attached: constraint.checked_residual(configuration.t, attached), attached)
-    still = _still(attached)
-    moved = lambda twists, speeds: constraint.checked_slip(configuration.t, _moving(attached, twists, speeds))
+    still = attached.still()
+    moved = lambda twists, speeds: constraint.checked_slip(configuration.t, attached.moving(twists, speeds))
     _, of_slip = jax.vjp(moved, still.twists, still.speeds)
 
     def load(multipliers):
@@ -184,8 +164,7 @@ def _acceleration(motion: Motion, constraint: AbstractConstraint, pace: ScalarLi
     to_q, to_rates = jax.jvp(change, (configuration.q,), (change(configuration.q),))
     first = _reads(configuration, constraint, first, to_q)
     second = _reads(configuration, constraint, second, to_rates)
-    twists, changes = (ByName(each, _what("body", constraint)) for each in (twists, changes))
-    speeds = ByName({name: motion.v[topology.speeds[name]] for name in at.coordinates}, _what("joint", constraint))
+    speeds = {name: motion.v[topology.speeds[name]] for name in at.coordinates}
     now = lambda s: t + s * pace if constraint.is_driven else t
 
     def along(s):
@@ -196,9 +175,9 @@ def _acceleration(motion: Motion, constraint: AbstractConstraint, pace: ScalarLi
         place, moved = (
             jax.tree.map(lambda at, first: at + s * first, *pair) for pair in ((at, first), (twists, changes))
         )
-        found = constraint.checked_slip(now(s), _moving(place, moved, speeds))
+        found = constraint.checked_slip(now(s), place.moving(moved, speeds))
         # What slips where nothing moves counts by the pace of time, too.
-        return found - (1.0 - pace) * constraint.checked_slip(now(s), _still(place)) if constraint.is_driven else found
+        return found - (1.0 - pace) * constraint.checked_slip(now(s), place.still()) if constraint.is_driven else found
 
     zero, one = jnp.zeros_like(t), jnp.ones_like(t)
     rate = lambda s: jax.jvp(along, (s,), (one,))[1]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import GROUND_NAME, BodyOrFrame, Frame, frame_of
+from linkax.model.names import ByName
 from linkax.model.numbers import value
 from linkax.model.terms import Term
 from linkax.spatial.vectors import cross
@@ -80,8 +81,8 @@ class Attached(AbstractPoses):
     - `quaternions`: the joints whose coordinates begin with one.
     """
 
-    poses: Mapping[str, BodyPose]
-    coordinates: Mapping[str, Float[Array, " n"]]
+    poses: ByName[BodyPose]
+    coordinates: ByName[Float[Array, "..."]]
     quaternions: tuple[str, ...] = eqx.field(static=True)
 
     def pose(self, body: str) -> BodyPose:
@@ -93,6 +94,18 @@ class Attached(AbstractPoses):
     def coordinate(self, term: Term) -> Float[Array, ""]:
         """Coordinate of one speed of a joint [rad or m]."""
         return self.coordinates[term.joint][(term.index or 0) + (term.joint in self.quaternions)]
+
+    def moving(self, twists: Mapping[str, "Twist"], speeds: Mapping[str, Array]) -> "Moving":
+        """The same with twists of the bodies, and speeds of the joints."""
+        named = ByName(twists, self.poses.what), ByName(speeds, self.coordinates.what)
+        return Moving(self.poses, self.coordinates, self.quaternions, *named)
+
+    def still(self) -> "Moving":
+        """The same at rest."""
+        zeros = {name: jnp.zeros_like(pose.position) for name, pose in self.poses.items()}
+        speeds = {name: entries[int(name in self.quaternions) :] for name, entries in self.coordinates.items()}
+        twists = {name: Twist(none, none) for name, none in zeros.items()}
+        return self.moving(twists, {name: jnp.zeros_like(entries) for name, entries in speeds.items()})
 
 
 class Twist(NamedTuple):
@@ -109,8 +122,8 @@ class Moving(Attached):
     joint's name.
     """
 
-    twists: Mapping[str, Twist]
-    speeds: Mapping[str, Float[Array, " n"]]
+    twists: ByName[Twist]
+    speeds: ByName[Float[Array, "..."]]
 
     def angular_velocity(self, body: BodyOrFrame) -> Float[Array, "3"]:
         """Angular velocity of a body in ground axes [rad/s]."""

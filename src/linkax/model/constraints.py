@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from linkax.model.attached import Attached, BodyPose, Moving, Twist
+from linkax.model.attached import Attached, BodyPose, Moving
 from linkax.model.bodies import Frame
-from linkax.model.elements import ENDED, AbstractElement, Time
-from linkax.model.functions import Law, raised
+from linkax.model.elements import AbstractElement, Time
+from linkax.model.functions import MISTAKES, Law, of_element
 from linkax.model.names import ByName
 from linkax.model.numbers import Number, number, require
 from linkax.model.terms import Term, TermLike, term
@@ -93,6 +93,13 @@ class AbstractConstraint(AbstractElement):
         """
         return [length ** POWERS_OF_LENGTH[unit] for unit in (*self.units, *self.slip_units)]
 
+    def attached(
+        self, poses: Mapping[str, BodyPose], coordinates: Mapping[str, Array], quaternions: tuple[str, ...]
+    ) -> Attached:
+        """Make what the residual reads; what else it asks for is refused by name."""
+        named = (ByName(poses, f"body of {self.display_name}"), ByName(coordinates, f"joint of {self.display_name}"))
+        return Attached(*named, quaternions)
+
     def checked_residual(self, t: Time, attached: Attached) -> Float[Array, " k"]:
         """Compute the residual and check it.
 
@@ -109,10 +116,8 @@ class AbstractConstraint(AbstractElement):
             return jnp.zeros(0)
         try:
             found = jnp.asarray(function(*arguments))
-        except ENDED as error:
-            if isinstance(error, ValueError) and str(error).startswith(self.display_name):
-                raise
-            raise ValueError(f"{self.display_name}: its {what} raises {raised(error, function, arguments)}") from error
+        except MISTAKES as error:
+            raise of_element(self.display_name, what, error, function, arguments) from error
         count = len(units)
         if found.shape not in ((count,), () if count == 1 else (count,)):
             raise ValueError(
@@ -128,12 +133,9 @@ class AbstractConstraint(AbstractElement):
 
         **Raises:** `ValueError` as `checked_residual` does, and for a residual that reads t without `is_driven`.
         """
-        turned = BodyPose(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))
-        names = dict.fromkeys(frame.body for frame in self.frames)
-        of_body, of_joint = f"body of {self.display_name}", f"joint of {self.display_name}"
-        joints = ByName({name: jnp.zeros(coordinates[name]) for name in self.joints}, of_joint)
-        twists = ByName({name: Twist(jnp.zeros(3), jnp.zeros(3)) for name in names}, of_body)
-        moving = Moving(ByName({name: turned for name in names}, of_body), joints, (), twists, joints)
+        unmoved = BodyPose(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))
+        poses = {frame.body: unmoved for frame in self.frames}
+        moving = self.attached(poses, {name: jnp.zeros(coordinates[name]) for name in self.joints}, ()).still()
         rows = lambda t: (self.checked_residual(t, moving), self.checked_slip(t, moving))
         traced = jax.make_jaxpr(rows)(0.0).jaxpr
         (time,) = traced.invars

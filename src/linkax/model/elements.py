@@ -15,8 +15,10 @@ Motion = Any
 Configuration = Any
 System = Any
 
-# What a mistake in a user's own element raises.
-ENDED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+
+def is_own(element: Any) -> bool:
+    """Tell whether an element is of a class that a user has written."""
+    return not type(element).__module__.startswith("linkax.")
 
 
 class AbstractElement(eqx.Module):

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import Frame
-from linkax.model.elements import ENDED, AbstractElement, Configuration, Motion, System, Time
-from linkax.model.functions import raised
+from linkax.model.elements import AbstractElement, Configuration, Motion, System, Time
+from linkax.model.functions import MISTAKES, of_element
 from linkax.model.internal_states import InternalState, States, by_name, joined_rates, shapes_of
 from linkax.model.numbers import Vector, number
 from linkax.xla.arrays import Array, Scalar
@@ -120,7 +120,7 @@ class AbstractForce(AbstractElement):
         """
         try:
             found = self.switch(t, motion)
-        except ENDED as error:
+        except MISTAKES as error:
             raise self._ended("switch", error, self.switch, (t, motion)) from error
         if not isinstance(found, jax.Array) or found.shape != () or not jnp.issubdtype(found.dtype, jnp.floating):
             raise ValueError(
@@ -143,7 +143,7 @@ class AbstractForce(AbstractElement):
         side = self._held_side(t, motion, on)
         try:
             found = self.load(t, motion, *side)
-        except ENDED as error:
+        except MISTAKES as error:
             raise self._ended("load", error, self.load, (t, motion, *side)) from error
         whole = Load.none(motion.system)
         if not isinstance(found, Load):
@@ -166,9 +166,7 @@ class AbstractForce(AbstractElement):
 
     def _ended(self, what, error, function, arguments):
         """What to raise where the load, the switch or the rates have raised an error."""
-        if isinstance(error, ValueError) and str(error).startswith(self.display_name):
-            return error
-        return ValueError(f"{self.display_name}: its {what} raises {raised(error, function, arguments)}")
+        return of_element(self.display_name, what, error, function, arguments)
 
     def potential_energy(self, configuration: Configuration, *args: Any) -> Scalar:
         """Compute the potential energy [J]; zero for an element without one."""
@@ -217,7 +215,7 @@ class Bound(AbstractForce):
         arguments = t, motion, *self._held_side(t, motion, on)
         try:
             found = self.element.rates(t, motion, self.named, *arguments[2:])
-        except ENDED as error:
+        except MISTAKES as error:
             raise self._ended("rates", error, self.element.rates, arguments) from error
         return joined_rates(self.element.states, found, self.display_name, motion.system.dtype)
 

@@ -75,6 +75,22 @@ class Law(eqx.Module):
         return found if jnp.issubdtype(found.dtype, jnp.floating) else 1.0 * found
 
 
+# What a mistake in a user's own element raises.
+MISTAKES = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+
+
+def of_element(
+    name: str, what: str, error: Exception, function: Callable[..., Any], arguments: Sequence[Any]
+) -> Exception:
+    """What to raise where a function of an element, such as its load, has raised an error: one that names both.
+
+    An error that names the element is its own.
+    """
+    if isinstance(error, ValueError) and str(error).startswith(name):
+        return error
+    return ValueError(f"{name}: its {what} raises {raised(error, function, arguments)}")
+
+
 def raised(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
     """Describe what a user's function raised for some arguments, and what helps."""
     first, *_ = str(error).split("\n")

@@ -120,8 +120,5 @@ class JointLimit(AlongJoint):
         depth, rate, sign = self._penetration(motion)
         return jnp.where(on, sign * self.law.normal(depth, rate), 0.0)
 
-    def load(self, t: Number, motion: Motion, on: Any) -> Any:
-        return motion.joint_load(self.joint, self.strength(t, motion, on))
-
     def potential_energy(self, configuration: Configuration) -> Scalar:
         return self.law.energy(-self.range.gap(configuration))

@@ -12,6 +12,7 @@ from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
 from linkax.model.constraints import AbstractConstraint, LinearConstraint
 from linkax.model.description import described
 from linkax.model.discretisation import Parts, discretise_beams, is_split, split_cuts, tree_joints_first
+from linkax.model.elements import is_own
 from linkax.model.forces import AbstractForce, given_name
 from linkax.model.immobile_rows import split_rows
 from linkax.model.internal_states import checked_states
@@ -234,7 +235,7 @@ def _check_references(
 
     for joint in joints.values():
         check_frames(f"joint {joint.name!r}", (joint.parent, joint.child))
-        if not type(joint).__module__.startswith("linkax."):
+        if is_own(joint):
             joint.check_transform()
     for force in forces:
         check_frames(force.display_name, force.frames)
@@ -247,7 +248,7 @@ def _check_references(
             check_joint(constraint.display_name, name)
             if isinstance(constraint, LinearConstraint):
                 _check_index(constraint.display_name, joints[name], index, True)
-        if not type(constraint).__module__.startswith("linkax."):
+        if is_own(constraint):
             constraint.check_residual({name: joints[name].num_coordinates for name in constraint.joints})
 
 

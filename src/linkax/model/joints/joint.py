@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
-from linkax.model.elements import ENDED
-from linkax.model.functions import raised
+from linkax.model.functions import MISTAKES, of_element
 from linkax.model.numbers import Axis, Constant, perpendicular_axes, require_bool, unit_axis, value
 from linkax.model.terms import Term
 from linkax.spatial.rotations import frame_about_axis
@@ -175,10 +174,8 @@ class AbstractJoint(eqx.Module):
         try:
             rotation, position = self.transform(at)
             shapes = jnp.shape(rotation), jnp.shape(position)
-        except ENDED as error:
-            if isinstance(error, ValueError) and str(error).startswith(what):
-                raise
-            raise ValueError(f"{what}: its transform raises {raised(error, self.transform, (at,))}") from error
+        except MISTAKES as error:
+            raise of_element(what, "transform", error, self.transform, (at,)) from error
         if shapes != ((3, 3), (3,)):
             raise ValueError(f"{what}: its transform returns shapes {shapes}; give axes (3, 3) and an origin (3,)")
         known = concrete(rotation)
@@ -190,9 +187,8 @@ class AbstractJoint(eqx.Module):
 
     def _at_one(self):
         """Coordinates of one, a quaternion of length one."""
-        return jnp.concatenate([jnp.full(4, 0.5)[: 4 * self.has_quaternion], jnp.ones(self.num_coordinates)])[
-            : self.num_coordinates
-        ]
+        ones = jnp.ones(self.num_coordinates)
+        return ones.at[:4].set(0.5) if self.has_quaternion else ones
 
     def frames(self) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Return h¹, h², h³ as columns, in the parent's and in the child's body axes."""
@@ -237,9 +233,8 @@ class Transform(RelativeMotion):
     @staticmethod
     def of(joint: AbstractJoint) -> "Transform":
         """Take it from a joint."""
-        own = [field for field in dataclasses.fields(joint) if field.name not in COMMON]
-        static = tuple((field.name, getattr(joint, field.name)) for field in own if field.metadata.get("static"))
-        leaves, structure = jax.tree.flatten(_traced_fields(joint))
+        static = tuple(_own_fields(joint, static=True).items())
+        leaves, structure = jax.tree.flatten(_own_fields(joint, static=False))
         fixed = tuple(None if _is_number(leaf) else leaf for leaf in leaves)
         shapes = tuple(np.shape(leaf) if _is_number(leaf) else None for leaf in leaves)
         return Transform(type(joint), static, structure, fixed, shapes)
@@ -258,16 +253,16 @@ class Transform(RelativeMotion):
         return found.at[:3, :3].set(rotation).at[:3, 3].set(position)
 
 
-def _traced_fields(joint):
-    """Fields of a joint's own class that are pytrees."""
+def _own_fields(joint, static):
+    """Fields of a joint's own class, by name: those that are static, or those that are pytrees."""
     own = [field for field in dataclasses.fields(joint) if field.name not in COMMON]
-    return {field.name: getattr(joint, field.name) for field in own if not field.metadata.get("static")}
+    return {field.name: getattr(joint, field.name) for field in own if field.metadata.get("static", False) == static}
 
 
 def own_numbers(joint: AbstractJoint) -> Float[Array, " k"]:
     """Numbers among the fields of a joint's own class, in one array."""
-    numbers = [jnp.ravel(jnp.asarray(leaf)) for leaf in jax.tree.leaves(_traced_fields(joint)) if _is_number(leaf)]
-    return jnp.concatenate([jnp.zeros(0), *numbers])
+    numbers = filter(_is_number, jax.tree.leaves(_own_fields(joint, static=False)))
+    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(jnp.asarray(leaf)) for leaf in numbers)])
 
 
 def _is_number(leaf):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from linkax.model.elements import is_own
 from linkax.model.functions import Law
 from linkax.model.internal_states import initial_values
 from linkax.model.mechanism import Mechanism
@@ -70,8 +71,8 @@ def sound_numbers(mechanism: Mechanism) -> Bool[Array, ""] | np.bool_:
     A user's own elements and functions are not looked at.
     """
     places = (mechanism.bodies, mechanism.beams, mechanism.joints, mechanism.forces, mechanism.constraints)
-    own = [element for element in chain(*places) if type(element).__module__.startswith("linkax.")]
-    arrays = [*filter(eqx.is_array, jax.tree.leaves(own, is_leaf=_is_law))]
+    known_kinds = [element for element in chain(*places) if not is_own(element)]
+    arrays = [*filter(eqx.is_array, jax.tree.leaves(known_kinds, is_leaf=_is_law))]
     traced = [array for array in arrays if concrete(array) is None]
     # At once: a call of NumPy takes longer than their few numbers.
     known = np.concatenate([np.zeros(0), *(np.ravel(array) for array in arrays if concrete(array) is not None)])
