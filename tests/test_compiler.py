@@ -54,6 +54,7 @@ def test_the_loop_over_steps_is_one_kernel(as_users_do):
     assert as_users_do["assembled_inside"]["of_run"] == [False]
 
 
+@pytest.mark.slow
 def test_slow_loops_are_told_unless_asked_for():
     """Where linkax is imported too late for its flags, all is computed on arrays."""
     found = _as_users_do("compiled_without_kernels.py")

@@ -74,10 +74,10 @@ MEMBERS = {
     "simulate": lambda mechanism, state: lx.simulate(mechanism, state, t1=1.0),
     "identity metric": lambda mechanism, state: lx.simulate(mechanism, state, t1=1.0, formulation=IDENTITY),
 }
-SLOW = pytest.param("identity metric", marks=pytest.mark.slow)
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("simulate", "identity metric")]
 
 
-@pytest.mark.parametrize("name", ["assemble", "simulate", SLOW])
+@pytest.mark.parametrize("name", ["assemble", *SLOW])
 def test_batches(large, name):
     assert not batched_calls(*in_a_batch(MEMBERS[name], *large))
 

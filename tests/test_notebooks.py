@@ -15,7 +15,7 @@ FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted([*FOLDER.glob("*.ipynb"), *FOLDER.glob("gallery/*.ipynb")])
 
 
-QUICK = ("crank_slider", "method")  # the others are minutes of compiling
+QUICK = ("method",)  # the others are minutes of compiling
 mark = lambda path: [] if path.stem in QUICK else [pytest.mark.slow]
 MARKED = [pytest.param(path, marks=mark(path), id=path.stem) for path in NOTEBOOKS]
 

@@ -21,6 +21,8 @@ DESCRIBED = {page: [*LISTS[page].split(), *BY_HAND[page]] for page in TEXTS}
 SLOW = tuple(
     f"reference/{page}"
     for page in (
+        "assembly",
+        "solution",
         "derivatives",
         "kinematics",
         "synthesis",

@@ -82,6 +82,7 @@ def test_rolled_up_by_a_moment():
         np.testing.assert_allclose(found.reaction(joint, on="parent").moment[0], [0.0, 0.0, 2.0 * np.pi], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_frequencies_of_a_cantilever():
     exact = roots(lambda x: np.cos(x) * np.cosh(x) + 1.0, [1.9, 4.7, 7.9]) ** 2
     np.testing.assert_allclose(frequencies(cantilever(), 3), exact, rtol=1e-3)

@@ -50,6 +50,7 @@ def test_a_bead_on_a_closed_spline():
     np.testing.assert_allclose(found.reaction("wire").force, expected, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_trolley_turns_with_its_rail():
     trolley = lx.RigidBody("trolley", 1.0, inertia=[0.01, 0.02, 0.03])
     joint = lx.CurveJoint("rail", lx.GROUND, trolley, lx.SplineCurve(LOOP, closed=True), follows="tangent")

@@ -78,6 +78,7 @@ def test_in_a_loop():
     np.testing.assert_allclose(found.joint("wire"), 7.0 + rate * found.ts**2 / 2.0, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives():
     reached = lambda radius: lx.simulate(
         sliding(radius), lx.assemble(sliding(radius)), t1=1.0, saveat=diffrax.SaveAt(t1=True)

@@ -123,6 +123,7 @@ def test_derivative_of_an_assembled_state():
     np.testing.assert_allclose(of_speed, jax.grad(jax.grad(exact, 2), (0, 1, 2))(*numbers), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_derivatives_where_only_some_arguments_are_traced():
     speeds = jax.vmap(lambda speed: lx.assemble(crank_slider(), {"bearing": 0.7}, {"bearing": speed}).v[0])
     np.testing.assert_allclose(speeds(jnp.arange(1.0, 3.0)), [1.0, 2.0], rtol=1e-12)

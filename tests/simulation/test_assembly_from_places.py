@@ -75,6 +75,7 @@ def test_places_and_velocities_in_the_world_are_held():
     np.testing.assert_allclose(state.v[mechanism.topology.speeds["A"]], 2.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_what_is_held_in_the_world():
     """Of the rocker's angle by the place of the crank's tip along its circle, and by the coupler's length."""
 

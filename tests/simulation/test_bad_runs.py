@@ -480,6 +480,7 @@ def _readings(numbers):
     return run.q, run.v, *found, of(lx.RESULTS.successful), of(lx.RESULTS.not_finite), finite
 
 
+@pytest.mark.slow
 def test_a_member_with_numbers_that_cannot_be_is_marked_and_changes_no_other():
     count = len(POSSIBLE) + 2
     right = {name: np.full(count, value) for name, value in POSSIBLE.items()}

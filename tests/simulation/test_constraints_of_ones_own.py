@@ -109,6 +109,7 @@ def test_a_bead_on_a_turning_line():
     assert found.worst_violation().acceleration < 1e-9
 
 
+@pytest.mark.slow
 def test_several_rows_and_joints():
     """A rod welded to another by a constraint that is redundant but for two rows."""
     rods = [lx.rod(name, 1.0, 1.0) for name in ("first", "second")]

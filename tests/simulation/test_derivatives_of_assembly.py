@@ -87,6 +87,7 @@ def test_a_number_of_python_that_a_law_closes_over():
     np.testing.assert_allclose(jax.jvp(height, (1.0,), (1.0,))[1], 2.0 * np.cos(0.5) * 0.5, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_fit_of_a_mass_alone():
     """That no loop depends on, with the state assembled inside of the residual."""
 

@@ -55,6 +55,7 @@ def solution():
     return lx.simulate(mechanism, moving(mechanism), t1=0.5, accuracy=lx.PRECISE, saveat=saveat)
 
 
+@pytest.mark.slow
 def test_force_and_length_by_name_and_by_element(solution):
     place, velocity = np.asarray(solution.position("bob")), np.asarray(solution.velocity("bob"))
     from_top, anchor = place - np.array([0.0, 3.0, 0.0]), place - np.array([1.0, 0.0, 0.0])

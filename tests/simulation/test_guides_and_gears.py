@@ -30,6 +30,7 @@ def conical(radius):
     return mechanism, lx.State(q, v, mechanism.topology), speed
 
 
+@pytest.mark.slow
 def test_a_ball_in_a_bowl_circles():
     mechanism, state, speed = conical(jnp.array(0.5))
     found = run(mechanism, state)
@@ -99,6 +100,7 @@ def test_planetary_gears(index, ratio):
     np.testing.assert_allclose(carrier, 9.0 * TS + 0.1 / inertia * TS**2, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_rack_on_a_slide():
     """A pinion on a slope of the rack: s̈ = g sin α · m / (m + I / r²), over many teeth; the reaction is I s̈ / r²."""
     rack, pinion = lx.RigidBody("rack", 1.0), lx.RigidBody("pinion", 2.0, inertia=[1e-3, 1e-3, 2e-3])

@@ -20,7 +20,14 @@ def _row_of_four_bars(_seed):
 
 
 @pytest.mark.parametrize(
-    "make", [_row_of_four_bars, mechanisms.floating, mechanisms.cut, mechanisms.driven, mechanisms.bending]
+    "make",
+    [
+        _row_of_four_bars,
+        mechanisms.floating,
+        mechanisms.cut,
+        mechanisms.driven,
+        pytest.param(mechanisms.bending, marks=pytest.mark.slow),
+    ],
 )
 def test_slopes_of_joints_are_those_along_all_speeds(make):
     mechanism = make(0)

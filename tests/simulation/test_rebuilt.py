@@ -69,6 +69,7 @@ def test_functions_made_anew_compile_nothing(of):
         np.testing.assert_allclose(found, EXACT[of](numbers), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_derivatives_by_an_array_that_drives_close_over():
     found, step = jax.jit(jax.jacfwd(moved))(NUMBERS), 1e-5
     np.testing.assert_allclose(found, jax.jacfwd(EXACT[moved])(NUMBERS), atol=1e-12)

@@ -80,6 +80,7 @@ def steady_spin(tilt, turning, radius=0.4):
     return needed / (1.5 * radius**2 * turning * cosine) - turning * sine
 
 
+@pytest.mark.slow
 def test_a_disc_rolls_steadily():
     """The tilt stays, and the centre goes around in a circle."""
     tilt, turning = 0.35, 1.8

@@ -219,6 +219,7 @@ def test_starts_at_any_distance_from_a_singular_configuration(rtol):
     assert np.max(errors_of_starts(states, NEXT_TO, speeds, rtol)) <= 100.0 * rtol
 
 
+@pytest.mark.slow
 def test_assembly_at_any_distance_from_a_singular_configuration():
     """Where the position tells the branch, one speed tells all; closer, that of a knee is asked too."""
     speed, states = -5.0, []

@@ -46,6 +46,7 @@ def test_equal_lengths_of_a_crank_slider_change_together_alone():
     np.testing.assert_allclose(difference @ found.directions, 0.0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_before_the_passage_all_is_differentiable():
     assert lx.differentiability(lambda params: crank_slider(params, t1=0.5), NUMBERS).ok
 
