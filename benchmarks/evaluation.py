@@ -3,15 +3,17 @@
 Each row: speeds and loop rows; microseconds for an evaluation as a step asks for it; what part of that the correction
 of positions and speeds takes; seconds to compile it, and kilobytes that it works in; and Pinocchio's microseconds for
 `constraintDynamics` at the same state, where it is installed. Part `problems`: those of `benchmarks.problems`, and the
-telescopic crane. Part `rows`: N four-bars in a row. Parts `chains` and `rings`: as many bodies, hinged to each other,
-from ground, and back to it. After those the exponents with which times grow. Times are of this machine, this run:
-compare ratios.
+telescopic crane. Part `rows`: N four-bars in a row. Part `joints`: each type of joint, a chain of five below a hinge,
+and one that closes a loop of two hinged bodies. Parts `chains` and `rings`: as many bodies, hinged to each other, from
+ground, and back to it. After those the exponents with which times grow. Times are of this machine, this run: compare
+ratios.
 """
 
 import itertools
 import math
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import jax
 import numpy as np
@@ -118,6 +120,49 @@ def rings() -> Iterator[dict]:
     yield from _growing("bodies", BODIES, lambda count: cost(*_bodies(count, closed=True)))
 
 
+JOINTS = {
+    "Revolute": partial(lx.Revolute, axis="z"),
+    "Prismatic": partial(lx.Prismatic, axis="x"),
+    "Screw": partial(lx.Screw, axis="z", pitch=0.1),
+    "Universal": partial(lx.Universal, axis="x", second_axis="y"),
+    "Cylindrical": partial(lx.Cylindrical, axis="z"),
+    "Rectangular": partial(lx.Rectangular, axis="z"),
+    "Planar": partial(lx.Planar, axis="z"),
+    "Spherical": lx.Spherical,
+    "Fixed": lx.Fixed,
+    "Free": lx.Free,
+}
+ROD = 0.4  # [m], of a `Distance`
+
+
+def joints() -> Iterator[dict]:
+    """A chain of five joints of each type, and one of them that closes a loop."""
+    for name, make in JOINTS.items():
+        yield {"joint": name, "place": "tree", **cost(*_chain_of(make))}
+        if name != "Free":
+            yield {"joint": name, "place": "cut", **cost(*_loop_with(partial(make, cut=True), apart=0.0))}
+        jax.clear_caches()
+    yield {"joint": "Distance", "place": "cut", **cost(*_loop_with(partial(lx.Distance, length=ROD), apart=ROD))}
+
+
+def _chain_of(make):
+    rods = [lx.rod(f"rod_{i}", 1.0, 1.0) for i in range(6)]
+    joints = [make(f"joint_{i}", rods[i].at("tip"), rods[i + 1].at("base")) for i in range(5)]
+    return _at_zero(rods, [lx.Revolute("hinge", lx.GROUND, rods[0].at("base"), "z"), *joints])
+
+
+def _loop_with(make, apart):
+    rods = [lx.rod(name, 1.0, 1.0) for name in ("left", "right")]
+    left, right = (lx.Revolute(f"hinge_{rod.name}", lx.GROUND, rod.at("base"), "z") for rod in rods)
+    closing = make("closing", rods[0].at("tip"), rods[1].at([1.0, apart, 0.0]))
+    return _at_zero(rods, [left, right, closing])
+
+
+def _at_zero(rods, joints):
+    mechanism = lx.Mechanism(rods, joints, [lx.Gravity([0.0, -9.81, 0.0])])
+    return mechanism, lx.assemble(mechanism)
+
+
 def _growing(name, counts, measure):
     found = []
     for count in counts:
@@ -144,4 +189,4 @@ def _bodies(count, closed):
 
 
 if __name__ == "__main__":
-    print_parts(__doc__, {"problems": problems, "rows": rows, "chains": chains, "rings": rings})
+    print_parts(__doc__, {"problems": problems, "rows": rows, "joints": joints, "chains": chains, "rings": rings})
