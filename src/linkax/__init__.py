@@ -66,6 +66,8 @@ from linkax.model.contact_law import ContactLaw as ContactLaw  # noqa: E402
 from linkax.model.contact_law import Friction as Friction  # noqa: E402
 from linkax.model.controllers import FirstOrderSensor as FirstOrderSensor  # noqa: E402
 from linkax.model.controllers import PIDController as PIDController  # noqa: E402
+from linkax.model.creep import Creep as Creep  # noqa: E402
+from linkax.model.creep import WheelRailContact as WheelRailContact  # noqa: E402
 from linkax.model.curves import PeriodicSpline as PeriodicSpline  # noqa: E402
 from linkax.model.curves import SplineCurve as SplineCurve  # noqa: E402
 from linkax.model.forces import AbstractForce as AbstractForce  # noqa: E402
@@ -125,6 +127,7 @@ from linkax.model.shapes import Sphere as Sphere  # noqa: E402
 from linkax.model.terms import Term as Term  # noqa: E402
 from linkax.model.time_laws import PiecewiseLinear as PiecewiseLinear  # noqa: E402
 from linkax.model.time_laws import Spline as Spline  # noqa: E402
+from linkax.model.wheel_rail import WheelOnRail as WheelOnRail  # noqa: E402
 from linkax.simulation.integrate.accuracy import BALANCED as BALANCED  # noqa: E402
 from linkax.simulation.integrate.accuracy import DRAFT as DRAFT  # noqa: E402
 from linkax.simulation.integrate.accuracy import PRECISE as PRECISE  # noqa: E402

@@ -126,6 +126,15 @@ CASES = {
     "Contact: radius": (
         lambda x: lx.Contact(lx.Sphere(LINK, x), lx.Plane(lx.GROUND), lx.ContactLaw(1.0)), 1.0, NOT_NEGATIVE,
     ),
+    "WheelRailContact: span": (
+        lambda x: lx.WheelRailContact(LINK, lx.GROUND, radius=jnp.cos, height=jnp.sin, span=x, law=lx.ContactLaw(1.0)),
+        np.array([-1.0, 1.0]),
+        [[1.0, -1.0], [0.0, 0.0], [np.nan, 1.0], [0.0, np.inf]],
+    ),
+    "WheelOnRail: offset": (
+        lambda x: lx.WheelOnRail("w", LINK, lx.GROUND.at(x), radius=jnp.cos, height=jnp.sin, span=[0.0, 1.0]), *VECTOR,
+    ),
+    "Creep: friction": (lambda x: lx.Creep(1.0, 1.0, x), 0.3, POSITIVE),
     "Clearance": (
         lambda x: lx.Clearance(*POINTS, clearance=x, radius=1.0, law=lx.ContactLaw(1.0)), 0.1, POSITIVE,
     ),

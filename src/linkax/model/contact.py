@@ -20,7 +20,7 @@ from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
 
 
-class _SurfaceContact(AbstractForce):
+class SurfaceContact(AbstractForce):
     """Forces of a contact law between the surfaces of two bodies."""
 
     name: eqx.AbstractVar[str | None]
@@ -37,7 +37,7 @@ class _SurfaceContact(AbstractForce):
 
     def _approach(self, motion: Motion, spot: Spot) -> tuple[Float[jax.Array, "3"], Scalar]:
         """The velocity of the first surface seen from the second, and the rate at which penetration grows [m/s]."""
-        velocities = [_velocity(motion, frame, arm) for frame, arm in zip(self.sides, spot.arms, strict=True)]
+        velocities = [velocity_at(motion, frame, arm) for frame, arm in zip(self.sides, spot.arms, strict=True)]
         velocity = velocities[0] - velocities[1]
         return velocity, -dot(spot.normal, velocity)
 
@@ -66,28 +66,32 @@ class _SurfaceContact(AbstractForce):
     def load(self, t: Number, motion: Motion, on: Any) -> Load:
         total = Load.none(motion.system)
         for spot, velocity, normal in self._normal_forces(motion, on):
-            force = normal * spot.normal
-            if self.law.friction is not None:
-                sliding = velocity - dot(spot.normal, velocity) * spot.normal
-                force = force + self.law.friction.force(normal, sliding)
+            tangential, moment = self.tangential(motion, spot, velocity, normal)
+            force = normal * spot.normal + tangential
             for frame, arm, sign in zip(self.sides, spot.arms, (1.0, -1.0), strict=True):
                 configuration = motion.configuration
-                at = configuration.arm(frame) + arm
-                total = total.plus(configuration.wrench(configuration.body(frame.body), at, sign * force, 0.0))
+                body, at = configuration.body(frame.body), configuration.arm(frame) + arm
+                total = total.plus(configuration.wrench(body, at, sign * force, sign * moment))
         return total
+
+    def tangential(self, motion: Motion, spot: Spot, velocity: Array, normal: Array) -> tuple[Any, Any]:
+        """Compute the force in the plane of contact, and the moment, on the first surface [N, N m]; dry friction."""
+        if self.law.friction is None:
+            return 0.0, 0.0
+        return self.law.friction.force(normal, velocity - dot(spot.normal, velocity) * spot.normal), 0.0
 
     def potential_energy(self, configuration: Configuration) -> Scalar:
         energies = [self.law.energy(-spot.gap) for spot in self.spots(configuration)]
         return sum(energies, jnp.zeros((), configuration.system.dtype))
 
 
-def _velocity(motion, frame, arm):
-    """Velocity of the body of a frame at a place, by the arm from the frame's origin [m/s]."""
+def velocity_at(motion: Motion, frame: Frame, arm: Float[Array, "3"]) -> Float[jax.Array, "3"]:
+    """Compute the velocity of the body of a frame at a place, by the arm from the frame's origin [m/s]."""
     body = motion.configuration.body(frame.body)
     return motion.velocity[body] + cross(motion.angular_velocity[body], motion.configuration.arm(frame) + arm)
 
 
-class Contact(_SurfaceContact):
+class Contact(SurfaceContact):
     """Contact of two shapes on two bodies by a contact law, with its friction.
 
     Spheres and capsules meet each other, and planes; a capsule on a plane touches with the spheres at both of its ends.
@@ -124,7 +128,7 @@ class Contact(_SurfaceContact):
         return self.shapes.spots(configuration)
 
 
-class Clearance(_SurfaceContact):
+class Clearance(SurfaceContact):
     """A journal in a bearing that is larger than it, in place of a pin: it flies, hits the bearing, and rolls along it.
 
     The bearing is a cylinder about the z axis of its frame, and the journal a disc of a radius smaller by `clearance`,
