@@ -68,7 +68,9 @@ def test_optimise_is_deprecated():
 
 def test_a_run_in_segments_is_the_run(monkeypatch):
     monkeypatch.setattr(progress_run, "LONG_RUN", 0.0)
-    told, kept, mechanism = [], [], pendulum()
+    told, kept, swinging = [], [], pendulum()
+    sensor = lx.FirstOrderSensor(lambda t, motion: motion.joint("pivot"), 0.3)  # which has an internal state
+    mechanism = lx.Mechanism(swinging.bodies, swinging.joints, [*swinging.forces, sensor])
     state = lx.assemble(mechanism, {"pivot": 0.3})
     options = {"t1": 2.0, "accuracy": lx.PRECISE}
     found = progress_run.simulate_in_segments(
@@ -80,6 +82,7 @@ def test_a_run_in_segments_is_the_run(monkeypatch):
     np.testing.assert_allclose([part.t_end for part in kept], np.linspace(0.0, 2.0, 21)[1:], rtol=1e-15)
     np.testing.assert_array_equal(kept[4].q, found.solution.q[:251])
     np.testing.assert_allclose(found.solution.q, whole.q, atol=1e-10)
+    np.testing.assert_allclose(found.solution.internal, whole.internal, atol=1e-10)
 
 
 def test_a_time_saved_more_than_once_holds_one_state():

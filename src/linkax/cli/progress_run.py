@@ -117,9 +117,10 @@ def _is_long(first, seconds):
 def _joined(parts) -> Solution:
     """One solution with as many times as a run without segments; the time between two belongs to the earlier one."""
     counted = {name: sum(part.stats[name] for part in parts) for name in parts[0].stats if name != "max_steps"}
+    kept = [name for name in Solution.by_time if getattr(parts[0], name) is not None]
     return dataclasses.replace(
         parts[-1],
-        **{name: _one_after_another([getattr(part, name) for part in parts]) for name in ("ts", "q", "v")},
+        **{name: _one_after_another([getattr(part, name) for part in parts]) for name in kept},
         stats=parts[-1].stats | counted,
         rank_nearby=np.max([part.rank_nearby for part in parts], axis=0),
         closest=min(part.closest for part in parts),
