@@ -47,7 +47,6 @@ from linkax.formulations.projection_operator import ProjectionOperator as Projec
 from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402
 from linkax.linalg.pivoted_qr import pivoted_qr as pivoted_qr  # noqa: E402
 from linkax.model.actuators import DCMotor as DCMotor  # noqa: E402
-from linkax.model.actuators import HydraulicCylinder as HydraulicCylinder  # noqa: E402
 from linkax.model.actuators import PneumaticSpring as PneumaticSpring  # noqa: E402
 from linkax.model.attached import Attached as Attached  # noqa: E402
 from linkax.model.attached import Moving as Moving  # noqa: E402
@@ -77,6 +76,8 @@ from linkax.model.gears import Gear as Gear  # noqa: E402
 from linkax.model.gears import Rack as Rack  # noqa: E402
 from linkax.model.guides import PointOnSurface as PointOnSurface  # noqa: E402
 from linkax.model.guides import Prescribed as Prescribed  # noqa: E402
+from linkax.model.hydraulics import HydraulicActuator as HydraulicActuator  # noqa: E402
+from linkax.model.hydraulics import HydraulicCylinder as HydraulicCylinder  # noqa: E402
 from linkax.model.impacts import Impact as Impact  # noqa: E402
 from linkax.model.internal_states import InternalState as InternalState  # noqa: E402
 from linkax.model.joint_forces import JointDamper as JointDamper  # noqa: E402

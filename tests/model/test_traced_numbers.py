@@ -111,6 +111,11 @@ CASES = {
             bulk_modulus=x,
         ), 1.0, POSITIVE,
     ),
+    "HydraulicActuator: leakage": (
+        lambda x: lx.HydraulicActuator(
+            "pin", 0.0, areas=(1.0, 1.0), closed=-1.0, stroke=1.0, valve=1.0, supply=1e7, dead_volume=1.0, leakage=x,
+        ), 0.0, NOT_NEGATIVE,
+    ),
     "PneumaticSpring: area": (
         lambda x: lx.PneumaticSpring(*POINTS, area=x, free_length=1.0, pressure=1e6), 1.0, POSITIVE,
     ),

@@ -121,7 +121,8 @@ class Metered(lx.HydraulicCylinder):
 def cylinder(opening, kind=lx.HydraulicCylinder, force=0.0, **numbers):
     load = lx.point_mass("load", MASS)
     slide = lx.Prismatic("slide", lx.GROUND, load, "x")
-    element = kind(lx.GROUND, load, opening, **CYLINDER | numbers, name="cylinder")
+    acts_on = ("slide",) if kind is lx.HydraulicActuator else (lx.GROUND, load)
+    element = kind(*acts_on, opening, **CYLINDER | numbers, name="cylinder")
     mechanism = lx.Mechanism([load], [slide], [element, lx.JointTorque("slide", force)])
     return mechanism, lx.assemble(mechanism, {"slide": 0.7})
 
@@ -138,14 +139,44 @@ def test_oil_that_flows_in_is_compressed_displaced_or_leaks():
         assert np.max(np.abs(oil - oil[0])) > 1e-2 * oil[0]
 
 
-def test_a_load_on_locked_oil_swings_as_on_a_spring():
+@pytest.mark.parametrize("kind", [lx.HydraulicCylinder, lx.HydraulicActuator], ids=["between-points", "along-a-slide"])
+def test_a_load_on_locked_oil_swings_as_on_a_spring(kind):
     """A step of force: x = F / K (1 − cos ω t), with ω² = K / m."""
-    mechanism, state = cylinder(0.0, force=100.0)
+    mechanism, state = cylinder(0.0, kind, force=100.0)
     frequency = np.sqrt(STIFFNESS / MASS)
     ts = np.linspace(0.0, 6.0 / frequency, 101)
     solution = lx.simulate(mechanism, state, t1=ts[-1], saveat=diffrax.SaveAt(ts=ts))
     moved = 100.0 / STIFFNESS * (1.0 - np.cos(frequency * ts))
     np.testing.assert_allclose(solution.joint("slide") - 0.7, moved, atol=1e-3 * 200.0 / STIFFNESS)
+
+
+def test_a_controlled_cylinder_is_behind_a_ramp_by_its_speed_over_the_gain():
+    """The opening is gain × what it is behind, over the speed at which the valve is fully open."""
+    speed, full = 0.05, 1e-7 * (2e7 / 2.0) ** 0.5 / 2e-3
+
+    def lag(gain):
+        behind = lambda t, motion: gain / full * (0.7 + speed * t - motion.length("cylinder"))
+        mechanism, state = cylinder(behind, lx.HydraulicActuator, areas=(2e-3, 2e-3), tank=0.0, damping=1e4)
+        solution = lx.simulate(mechanism, state, t1=4.0)
+        x = solution.joint("slide")
+        np.testing.assert_allclose(solution.length("cylinder"), x, rtol=1e-15)
+        return 0.7 + 4.0 * speed - x[-1]
+
+    drop = (2e7 - speed * 1e4 / 2e-3) / 2.0  # in each half of the valve, less what moves the seals
+    lags = np.array([lag(jnp.array(gain)) for gain in (5.0, 10.0)])
+    np.testing.assert_allclose(lags, speed / np.array([5.0, 10.0]) * np.sqrt(1e7 / drop), rtol=1e-4)
+
+
+def test_a_rotary_actuator_turns_as_far_as_its_oil():
+    """An arm on a hinge, without load and leakage, moves by the oil over the volume of a radian."""
+    opening = lx.PiecewiseLinear([0.0, 0.1, 0.4, 0.5], [0.0, 0.5, 0.5, 0.0])
+    numbers = {"areas": (2e-4, 2e-4), "dead_volume": 1e-4, "closed": -1.0, "stroke": 2.0, "valve": 1e-8, "supply": 1e7}
+    actuator = lx.HydraulicActuator("hinge", opening, **numbers, damping=20.0, pressures=(5e6, 5e6), name="motor")
+    mechanism = lx.Mechanism([ARM], [HINGE], [actuator])
+    solution = lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": -0.5}), t1=1.0)
+    flow = 0.5 * 0.4 * 1e-8 * np.sqrt(5e6)  # through each half of the valve, with half of the pressure
+    assert abs(solution.end.q[0] + 0.5 - flow / 2e-4) < 0.02 * flow / 2e-4
+    np.testing.assert_allclose(solution.force("motor")[-1], 0.0, atol=0.1)
 
 
 def test_a_cylinder_is_drawn():
@@ -209,6 +240,10 @@ def test_wrong_numbers_are_told():
         lx.PiecewiseLinear([0.0, 1.0], [1.0])
     with pytest.raises(ValueError, match="HydraulicCylinder 'cylinder': areas"):
         cylinder(0.0, areas=(0.0, 1.0))
+    with pytest.raises(ValueError, match="HydraulicActuator 'cylinder': stroke \\[m or rad\\]"):
+        cylinder(0.0, lx.HydraulicActuator, stroke=0.0)
+    with pytest.raises(ValueError, match="unknown force or constraint 'jack'; known: 'cylinder'"):
+        lx.simulate(*cylinder(lambda t, motion: motion.length("jack")), t1=0.1)
     with pytest.raises(ValueError, match="it must be no smaller than coulomb"):
         lx.LuGreFriction("hinge", **FRICTION | {"static": 1.0})
     with pytest.raises(ValueError, match="it must be larger than closed"):
@@ -225,9 +260,11 @@ def _controlled(values):
     areas = {"areas": (2e-5, 1.2e-5), "dead_volume": 1e-5, "valve": 1e-8, "closed": 0.5, "stroke": 2.0}
     opening = lx.PiecewiseLinear([0.0, 0.8], 0.1 * values[:2])
     jack = lx.HydraulicCylinder(post, ARM.at("tip"), opening, **CYLINDER | areas | {"supply": 1e6})
-    mechanism = hinged(motor, friction, controller, maxwell, jack)
+    rotary = {"areas": (2e-5, 2e-5), "dead_volume": 1e-5, "valve": 1e-8, "closed": -1.0, "stroke": 4.0, "supply": 1e6}
+    turning = lx.HydraulicActuator("hinge", opening, **CYLINDER | rotary, leakage=1e-12 * values[0])
+    mechanism = hinged(motor, friction, controller, maxwell, jack, turning)
     solution = lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": 0.3}), t1=0.6, accuracy=lx.PRECISE)
-    return jnp.concatenate([solution.end.q, solution.end.internal / jnp.array([1.0, 0.01, 1.0, 1.0, 1.0, 1e6, 1e6])])
+    return jnp.concatenate([solution.end.q, solution.end.internal / jnp.array([1.0, 0.01, 1.0, 1.0, 1.0, *[1e6] * 4])])
 
 
 @pytest.mark.slow

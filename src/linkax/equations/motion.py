@@ -17,6 +17,7 @@ from linkax.equations.tree_sums import along_path, expand_to_motions, sum_by_bod
 from linkax.model.attached import alone
 from linkax.model.bodies import BodyOrFrame, frame_of
 from linkax.model.forces import Load
+from linkax.model.names import find
 from linkax.model.numbers import Number
 from linkax.model.terms import Term
 from linkax.spatial.rotations import rotate
@@ -31,9 +32,9 @@ from linkax.xla.tracing import jit_inline
 class Motion(eqx.Module):
     """The motion of all bodies at (t, q, v): what a force element reads, and how it makes its load.
 
-    `joint` and `joint_speed` read it by a joint's name, `point_position`, `point_velocity` and `orientation` at a body
-    or `body.at(...)`, in ground axes; `point_load` and `joint_load` make loads. Its arrays are in the order of the
-    bodies, ground last:
+    `joint` and `joint_speed` read it by a joint's name, `length` by that of a force or constraint, `point_position`,
+    `point_velocity` and `orientation` at a body or `body.at(...)`, in ground axes; `point_load` and `joint_load` make
+    loads. Its arrays are in the order of the bodies, ground last:
 
     - `angular_velocity` [rad/s], (n_b + 1, 3); `velocity` of reference points [m/s], (n_b + 1, 3).
     - `angular_bias` [rad/s²], `bias` [m/s²]: velocity-product accelerations, the part without v̇, (n_b + 1, 3).
@@ -68,6 +69,16 @@ class Motion(eqx.Module):
         """Speeds of a joint, in the tree or cut [rad/s or m/s]."""
         topology = self.system.topology
         return self.v[topology.speeds[name]] if name in topology.speeds else self.cut_speeds([name])[0]
+
+    def length(self, name: str) -> Float[Array, ""]:
+        """Length of a force element or constraint of this name [m], see `linkax.Solution.length`.
+
+        **Raises:** `ValueError` for an unknown name, and for an element without length.
+        """
+        elements = [*(force.itself for force in self.system.forces), *self.system.constraints]
+        named = {element.name: element for element in elements if getattr(element, "name", None)}
+        find(name, [*named], "force or constraint")
+        return named[name].extent(self.configuration)
 
     def cut_speeds(self, names: Sequence[str]) -> Float[Array, "k n"]:
         """Speeds of cut joints of one type [rad/s or m/s]."""

@@ -1,4 +1,4 @@
-"""Actuators with internal states: motors, hydraulic cylinders, gas springs."""
+"""Actuators with internal states: motors, gas springs. Hydraulic ones are in `hydraulics`."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -75,139 +75,6 @@ class DCMotor(AlongJoint):
 
     def strength(self, t: Number, motion: Motion, states: States) -> Scalar:
         return self.constant * states["current"]
-
-
-class HydraulicCylinder(BetweenPoints):
-    """A double-acting hydraulic cylinder between two points, fed through a proportional valve.
-
-    Chamber A pushes the points apart, chamber B, on the side of the rod, pulls them together; x is the distance of the
-    points less `closed`, and p the pressure of a chamber:
-
-    - V_A = V₀ + A_A x, V_B = V₀ + A_B (stroke − x), pull p_B A_B − p_A A_A + damping × ẋ.
-    - V_A ṗ_A = β (Q_A − A_A ẋ − c (p_A − p_B)), V_B ṗ_B = β (Q_B + A_B ẋ + c (p_A − p_B)).
-    - At an opening u > 0, Q_A = K u √(p_S − p_A) and Q_B = −K u √(p_B − p_T); at u < 0 supply and tank are exchanged.
-      Roots are rounded within `laminar` of zero, where the flow turns.
-
-    Its states are "a" and "b", the pressures of the chambers [Pa]. As u passes zero, flows have a kink. Jelali and
-    Kroll, Hydraulic Servo-systems (2003), ch. 4.
-
-    **Arguments:**
-
-    - `first`, `second`: a body (its reference frame), `body.at(...)`, or `lx.GROUND`.
-    - `opening`: of the valve, u from −1 to 1, a number, or a function (t, motion) ↦ number; see `linkax.JointTorque`.
-    - `areas`: (A_A, A_B) [m²]. `closed`: the distance of the points at x = 0 [m]; `stroke`: the largest x [m].
-    - `valve`: K [m³/s/√Pa], the flow at u = 1 over the root of the pressure drop. `supply`, `tank`: p_S, p_T [Pa].
-    - `bulk_modulus`: β [Pa]. `dead_volume`: V₀ of each chamber with its lines [m³]. `leakage`: c [m³/s/Pa].
-    - `damping`: of the seals [N s/m]. `laminar` [Pa].
-    - `pressures`: (p_A, p_B) at the start [Pa]; by default that of the tank.
-    - `name`: see `linkax.AbstractForce`.
-
-    The piston may leave the stroke: nothing stops it, and beyond the dead volume no state is finite. Pressures may fall
-    below zero, as oil without cavitation would.
-
-    **Raises:** `ValueError` for a number outside of what it can be.
-    """
-
-    opening: Scalar | Law
-    area_a: Scalar
-    area_b: Scalar
-    closed: Scalar
-    stroke: Scalar
-    valve: Scalar
-    supply: Scalar
-    tank: Scalar
-    bulk_modulus: Scalar
-    dead_volume: Scalar
-    leakage: Scalar
-    damping: Scalar
-    laminar: Scalar
-    pressure_a: Scalar
-    pressure_b: Scalar
-
-    def __init__(
-        self,
-        first: BodyOrFrame,
-        second: BodyOrFrame,
-        opening: Control,
-        *,
-        areas: tuple[Number, Number],
-        closed: Number,
-        stroke: Number,
-        valve: Number,
-        supply: Number,
-        tank: Number = 0.0,
-        bulk_modulus: Number = 1.4e9,
-        dead_volume: Number,
-        leakage: Number = 0.0,
-        damping: Number = 0.0,
-        laminar: Number = 1e4,
-        pressures: tuple[Number, Number] | None = None,
-        name: str | None = None,
-    ) -> None:
-        self.name = optional_name(name, "HydraulicCylinder")
-        self.first, self.second = two_points("HydraulicCylinder", first, second)
-        of = f"{self.display_name}:"
-        self.opening = number_or_law(opening, (), f"{of} opening")
-        both = require(number(areas, (2,), f"{of} areas [m²]"), lambda x: (x > 0.0).all(), f"{of} areas [m²]", POSITIVE)
-        self.area_a, self.area_b = both[0], both[1]
-        self.closed = zero_or_more(closed, f"{of} closed [m]")
-        self.stroke = positive(stroke, f"{of} stroke [m]")
-        self.valve = zero_or_more(valve, f"{of} valve [m³/s/√Pa]")
-        self.tank = number(tank, (), f"{of} tank [Pa]")
-        self.supply = positive(supply, f"{of} supply [Pa]")
-        self.bulk_modulus = positive(bulk_modulus, f"{of} bulk_modulus [Pa]")
-        self.dead_volume = positive(dead_volume, f"{of} dead_volume [m³]")
-        self.leakage = zero_or_more(leakage, f"{of} leakage [m³/s/Pa]")
-        self.damping = zero_or_more(damping, f"{of} damping [N s/m]")
-        self.laminar = positive(laminar, f"{of} laminar [Pa]")
-        begin = (self.tank, self.tank) if pressures is None else number(pressures, (2,), f"{of} pressures [Pa]")
-        self.pressure_a, self.pressure_b = begin[0], begin[1]
-
-    @property
-    def states(self) -> Mapping[str, InternalState]:
-        begin = {"a": self.pressure_a, "b": self.pressure_b}
-        return {name: InternalState(pressure, "Pa", scale=self.supply) for name, pressure in begin.items()}
-
-    def volumes(self, configuration: Configuration) -> dict[str, Scalar]:
-        """Compute the volumes of the chambers with their lines, "a" and "b" [m³]."""
-        x = self.extent(configuration) - self.closed
-        return {
-            "a": self.dead_volume + self.area_a * x,
-            "b": self.dead_volume + self.area_b * (self.stroke - x),
-        }
-
-    def flows(self, t: Number, motion: Motion, states: States) -> dict[str, Scalar]:
-        """Compute the oil that flows into each chamber through the valve, "a" and "b", and from "a" to "b" past the
-        piston, "leakage" [m³/s].
-        """
-        opening = evaluated(self.opening, t, motion)
-        onward, back = jnp.maximum(opening, 0.0), jnp.maximum(-opening, 0.0)
-
-        def through(open_to_supply, open_to_tank, pressure):
-            filled, drained = self._root(self.supply - pressure), self._root(pressure - self.tank)
-            return self.valve * (open_to_supply * filled - open_to_tank * drained)
-
-        return {
-            "a": through(onward, back, states["a"]),
-            "b": through(back, onward, states["b"]),
-            "leakage": self.leakage * (states["a"] - states["b"]),
-        }
-
-    def _root(self, drop):
-        """The root of a pressure drop with its sign, linear near zero."""
-        return drop / (drop**2 + self.laminar**2) ** 0.25
-
-    def rates(self, t: Number, motion: Motion, states: States) -> States:
-        flows, volumes = self.flows(t, motion, states), self.volumes(motion.configuration)
-        speed = self.distance_rate(motion)
-        gain = {
-            "a": flows["a"] - flows["leakage"] - self.area_a * speed,
-            "b": flows["b"] + flows["leakage"] + self.area_b * speed,
-        }
-        return {name: self.bulk_modulus * gain[name] / volumes[name] for name in gain}
-
-    def strength(self, t: Number, motion: Motion, states: States) -> Scalar:
-        return states["b"] * self.area_b - states["a"] * self.area_a + self.damping * self.distance_rate(motion)
 
 
 class PneumaticSpring(BetweenPoints):
@@ -300,5 +167,4 @@ class PneumaticSpring(BetweenPoints):
         return (self.free_length - self.closed) / (self.extent(configuration) - self.closed)
 
 
-POSITIVE = "they must be positive"
 SMALL = 1e-8  # up to which a series of two terms is exact to rounding
