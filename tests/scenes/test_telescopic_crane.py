@@ -1,11 +1,23 @@
-"""The telescopic crane against beam theory, rigid sections and its own linearisation, and its balance of energy."""
+"""The telescopic crane against beam theory, rigid sections and its own linearisation; its energy, oil and courses."""
 
 import diffrax
+import jax
 import numpy as np
 import pytest
-from cranes import REACH, at_rest, chain_of_beams, crane, deflection, main_frequency, rigid, slopes_and_differences
+from cranes import (
+    REACH,
+    SCENE,
+    at_rest,
+    chain_of_beams,
+    crane,
+    deflection,
+    main_frequency,
+    rigid,
+    slopes_and_differences,
+)
 
 import linkax as lx
+from linkax.scenes.telescopic_crane import STROKES, Course, Reach
 
 
 @pytest.mark.slow
@@ -64,3 +76,54 @@ def test_derivatives():
     """Of the deflection, and of the main frequency, by height, modulus and load; whatever the number of elements."""
     slopes, differences = slopes_and_differences(elements=1)
     np.testing.assert_allclose(slopes, differences, rtol=1e-5)
+
+
+def lifted(**changes):
+    """The hydraulic crane while it lifts and extends, and by how much its cylinders are behind their courses [m]."""
+    parameters, mechanism, state = crane("hydraulic", elements=1, **changes)
+    times = np.linspace(0.0, 4.0, 801)
+    found = lx.simulate(mechanism, state, t1=4.0, saveat=diffrax.SaveAt(ts=times), accuracy=lx.Accuracy(rtol=1e-7))
+    course = lambda name: Course(
+        *map(np.float64, (parameters[name], parameters[name] + parameters[f"{name}_change"], parameters["duration"]))
+    )
+    courses = {"luffing": Reach(course("angle")), "telescoping": course("extension")}
+    behind = {name: jax.vmap(course)(times) - found.length(name) for name, course in courses.items()}
+    return parameters, found, courses, behind
+
+
+@pytest.mark.slow
+def test_hydraulic_cylinders_carry_the_crane_at_rest():
+    """With the reactions of prescribed lengths; where oil leaks, pressures add up to that of the pump."""
+    parameters, mechanism, state = crane("hydraulic", elements=1)
+    for name in STROKES:
+        pressures = lx.Solution.of_state(mechanism, state).states(name)
+        np.testing.assert_allclose(pressures["a"] + pressures["b"], parameters["supply"], rtol=1e-9)
+    # Without leakage cylinders have the prescribed lengths at rest; else they are behind by what opens the valves.
+    parameters, mechanism, state = crane("hydraulic", elements=1, leakage=0.0)
+    found = lx.Solution.of_state(mechanism, state)
+    prescribed = SCENE.mechanism(parameters | {"cylinders": 1})
+    held = lx.Solution.of_state(prescribed, lx.State(state.q, state.v))
+    for name in STROKES:
+        np.testing.assert_allclose(found.force(name), held.reaction(name), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_hydraulic_cylinders_follow_their_courses():
+    """The less behind, the higher the gain; their oil is compressed, displaced or leaks."""
+    peaks = []
+    for gain in (0.5, 1.0):
+        parameters, found, courses, behind = lifted(gain=gain, bulk_modulus=1.4e10)
+        peaks.append([np.max(np.abs(behind[name])) for name in STROKES])
+    assert np.all(np.array(peaks[1]) < 0.75 * np.array(peaks[0]))
+    assert np.all(np.array(peaks[0]) < 0.1)
+    for name, (closed, _) in STROKES.items():
+        area, bulk = np.pi / 4.0 * parameters[f"{name}_bore"] ** 2, parameters["bulk_modulus"]
+        pressure, other = (np.asarray(found.states(name)[chamber]) for chamber in ("a", "b"))
+        speed = jax.vmap(jax.grad(courses[name]))(found.ts)
+        opened = (speed + gain * behind[name]) * area / np.sqrt(parameters["supply"] / 2.0)
+        flow = opened * np.sqrt(parameters["supply"] - pressure) - parameters["leakage"] * (pressure - other)
+        density = np.exp(pressure / bulk)
+        oil = density * (parameters["dead_volume"] + area * (np.asarray(found.length(name)) - closed))
+        rate = density * flow
+        gained = np.cumsum(rate[:-2:2] + 4.0 * rate[1:-1:2] + rate[2::2]) * (found.ts[2] - found.ts[0]) / 6.0
+        np.testing.assert_allclose(oil[2::2] - oil[0], gained, atol=1e-4 * np.ptp(oil))

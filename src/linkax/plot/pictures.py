@@ -14,14 +14,19 @@ def write_pictures(solution: Solution, points: Points, folder: Path) -> list[Pat
     """Write the pictures of a run, of the times that it reached, and return their paths.
 
     These are the motion of each named point (of the crank-slider's slider: Fig. 8 of the paper), the violations
-    (Fig. 10), the reaction of each joint on ground (of the guide: Fig. 11), the energy, and the mechanism in motion:
-    `mechanism.html`, in three dimensions for a browser, and the animation `mechanism.gif`.
+    (Fig. 10), the reaction of each joint on ground (of the guide: Fig. 11), the energy, the internal states of each
+    force that has some, and the mechanism in motion: `mechanism.html`, in three dimensions for a browser, and the
+    animation `mechanism.gif`.
     """
     figures = {f"motion_{name}": plot.motion(solution, body, at, name) for name, (body, at) in points.items()}
     figures |= {"violations": plot.violations(solution), "energy": plot.energy(solution)}
-    for joint in solution.mechanism.joints:
-        if joint.name in _on_ground(solution.mechanism):
+    mechanism = solution.mechanism
+    for joint in mechanism.joints:
+        if joint.name in _on_ground(mechanism):
             figures[f"reaction_{joint.name}"] = plot.reaction(solution, joint.name)
+    for name, force in zip(mechanism.force_names, mechanism.forces, strict=True):
+        if force.states:
+            figures[f"states_{name}"] = plot.states(solution, name)
     written = []
     for name, figure in figures.items():
         with written_whole(folder / f"{name}.png") as path:

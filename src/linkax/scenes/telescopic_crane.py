@@ -5,12 +5,17 @@ rear end and on a pad at the front end of that one. One cylinder luffs the boom,
 out, and a rope from the first section over a sheave at the front of the second pulls the third one out as far. The
 load hangs on a rope from the tip.
 
+Both cylinders have prescribed lengths, or are hydraulic: then a valve feeds each, which a controller opens so that the
+cylinder takes the same course.
+
 Sizes are about those of a mobile crane for 30 tonnes, from no data sheet.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 import linkax as lx
@@ -24,6 +29,7 @@ FOOT = (2.0, -1.0)  # of the luffing cylinder, from the boom's pivot [m]
 HEAD = 4.0  # of the luffing cylinder, along the boom [m]
 END = 1.0  # of the extension rope and its sheave, from the ends of the sections [m]
 SHEAVE = 0.2  # of the same, above the axes of the sections [m]
+STROKES = {"luffing": (2.0, 3.2), "telescoping": (0.0, 8.0)}  # where a cylinder is closed, and its stroke [m]
 STEEL = {"poissons_ratio": 0.3, "density": 7850.0}
 
 
@@ -92,6 +98,26 @@ def _telescope(
     ]
 
 
+def _hydraulic(parameters: Parameters, name: str, course: Course | Reach) -> dict[str, Any]:
+    """What a hydraulic cylinder is given, but for what it acts on.
+
+    Its valve opens as far as the course asks for, and farther in proportion to what the cylinder is behind.
+    """
+    bore, rod, gain = parameters[f"{name}_bore"], parameters[f"{name}_rod"], jnp.asarray(parameters["gain"])
+    areas = jnp.pi / 4.0 * bore**2, jnp.pi / 4.0 * (bore**2 - rod**2)
+    numbers = {key: parameters[key] for key in ("supply", "valve", "bulk_modulus", "dead_volume", "leakage")}
+    half = parameters["supply"] / 2.0  # about the pressures, and their drop in the valve
+    full_speed = jnp.asarray(parameters["valve"] * half**0.5 / areas[0])
+
+    def opening(t, motion):
+        wanted, speed = jax.jvp(course, (t,), (jnp.ones_like(t),))
+        return jnp.clip((speed + gain * (wanted - motion.length(name))) / full_speed, -1.0, 1.0)
+
+    numbers |= {"areas": areas, "damping": parameters["seals"], "pressures": (half, half)}
+    closed, stroke = STROKES[name]
+    return {"name": name, "opening": opening, "closed": closed, "stroke": stroke, **numbers}
+
+
 def _mechanism(parameters: Parameters) -> lx.Mechanism:
     boom = first, second, third = _boom(parameters)
     planar = parameters["planes"] == 1
@@ -107,7 +133,20 @@ def _mechanism(parameters: Parameters) -> lx.Mechanism:
     payload = lx.point_mass("payload", parameters["payload"])
     shoes_2, pads_2 = _telescope(first, second, 2, hinge)
     shoes_3, pads_3 = _telescope(second, third, 3, hinge)
-    extension = _course(parameters, "extension")
+    foot, head = turntable.at([*FOOT, 0.0]), first.at(HEAD)
+    lengths = {"luffing": Reach(_course(parameters, "angle")), "telescoping": _course(parameters, "extension")}
+    forces, cylinders = [], []
+    if parameters["cylinders"] == 1:
+        cylinders = [
+            lx.Rope("luffing", [foot, head], lengths["luffing"]),
+            lx.Drive("telescoping", "extension_2", lengths["telescoping"]),
+        ]
+    else:
+        luffing, telescoping = (_hydraulic(parameters, name, course) for name, course in lengths.items())
+        forces = [
+            lx.HydraulicCylinder(foot, head, **luffing),
+            lx.HydraulicActuator("extension_2", **telescoping),
+        ]
     above = lambda section, along: section.at([along, SHEAVE, 0.0])
     return lx.Mechanism(
         [turntable, *boom, *shoes_2, *shoes_3, payload],
@@ -118,11 +157,10 @@ def _mechanism(parameters: Parameters) -> lx.Mechanism:
             *pads_3,
             hinge("hook", third.at("tip"), payload.at([0.0, parameters["hoist"], 0.0]), second_axis="x"),
         ],
-        [lx.Gravity([0.0, -parameters["gravity"], 0.0])],
+        [lx.Gravity([0.0, -parameters["gravity"], 0.0]), *forces],
         [
             lx.Drive("slewing", "slew", _course(parameters, "slew")),
-            lx.Rope("luffing", [turntable.at([*FOOT, 0.0]), first.at(HEAD)], Reach(_course(parameters, "angle"))),
-            lx.Drive("telescoping", "extension_2", extension),
+            *cylinders,
             lx.Rope(
                 "extension_rope",
                 [above(first, SECTION - END), above(second, SECTION - END), above(third, END)],
