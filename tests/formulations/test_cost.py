@@ -10,7 +10,7 @@ from linkax.equations import constraint_rows, coordinates, joint_motions, loops
 from linkax.equations.coordinates import neutral
 from linkax.equations.structure import structure_of
 from linkax.equations.system import system_of
-from linkax.model import ropes
+from linkax.model.constraints import ropes
 
 
 class PinInPlane(lx.Revolute):

@@ -9,7 +9,7 @@ import pytest
 
 import linkax as lx
 from linkax.model.bodies import AbstractBody
-from linkax.model.constraints import AbstractConstraint
+from linkax.model.constraints.constraint import AbstractConstraint
 
 LINK = lx.rod("link", 1.0, 1.0)
 STEEL = lx.Material(2.1e11, 0.3, 7850.0)

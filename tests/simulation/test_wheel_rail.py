@@ -14,7 +14,7 @@ from linkax.equations.coordinates import rates
 from linkax.equations.dynamics import along_speeds
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
-from linkax.model.wheel_rail import WheelRailPair
+from linkax.model.forces.wheel_rail import WheelRailPair
 
 G = 9.81
 RADIUS, CONICITY, HALF, CROWN = 0.46, 0.05, 0.75, 0.02  # of wheelsets: radius, cone, half the gauge, radius of rails

@@ -18,7 +18,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
 from linkax.equations.system import System
 from linkax.linalg.saddle_inverse import SaddleInverse, invert
-from linkax.model.constraints import Coupling
+from linkax.model.constraints.constraint import Coupling
 from linkax.simulation.start.closing import CLOSED, LoopClosure, close_loops
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance

@@ -11,7 +11,7 @@ from jaxtyping import ArrayLike, Bool, Float
 
 from linkax.analysis.continuation import Asked
 from linkax.equations.configuration import Configuration
-from linkax.model.constraints import AbstractConstraint, Drive
+from linkax.model.constraints.constraint import AbstractConstraint, Drive
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import is_finite, namespace, real, require, require_type
 from linkax.model.poses import Pose

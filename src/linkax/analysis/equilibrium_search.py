@@ -19,7 +19,7 @@ from linkax.equations.system import System
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
-from linkax.model.internal_states import scales
+from linkax.model.forces.internal_states import scales
 from linkax.simulation.start.closing import LONGEST_STEP
 from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one

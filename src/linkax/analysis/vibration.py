@@ -31,7 +31,7 @@ from linkax.equations.system import System, system_of
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
-from linkax.model.internal_states import scales
+from linkax.model.forces.internal_states import scales
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import whole_number
 from linkax.simulation.explain.diagnosis import massless_bodies

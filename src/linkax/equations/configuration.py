@@ -19,7 +19,7 @@ from linkax.linalg.static_sparse import constant_product
 from linkax.model.attached import AbstractPoses, BodyPose
 from linkax.model.beams import Beam
 from linkax.model.bodies import Frame
-from linkax.model.forces import Load
+from linkax.model.forces.force import Load
 from linkax.model.joints.bending import section_at
 from linkax.model.numbers import Number
 from linkax.model.terms import Term

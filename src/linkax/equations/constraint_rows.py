@@ -17,8 +17,8 @@ from linkax.equations.coordinates import rates
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
 from linkax.model.attached import Attached, BodyPose, Twist
-from linkax.model.constraints import AbstractConstraint
-from linkax.model.forces import Load
+from linkax.model.constraints.constraint import AbstractConstraint
+from linkax.model.forces.force import Load
 from linkax.spatial.vectors import cross
 from linkax.xla.arrays import Array, ScalarLike
 

@@ -14,7 +14,7 @@ from linkax.equations.configuration import Configuration, along_speeds
 from linkax.equations.motion import Motion
 from linkax.equations.tree_sums import along_path, expand_to_motions, over_subtree, sum_by_body
 from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs
-from linkax.model.forces import Load
+from linkax.model.forces.force import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
 from linkax.xla.arrays import Array, Scalar

@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
-from linkax.model.forces import Bound
-from linkax.model.internal_states import shapes_of, size_of
+from linkax.model.forces.force import Bound
+from linkax.model.forces.internal_states import shapes_of, size_of
 from linkax.xla.arrays import Array
 
 

@@ -16,7 +16,7 @@ from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, expand_to_motions, sum_by_body
 from linkax.model.attached import alone
 from linkax.model.bodies import BodyOrFrame, frame_of
-from linkax.model.forces import Load
+from linkax.model.forces.force import Load
 from linkax.model.names import find
 from linkax.model.numbers import Number
 from linkax.model.terms import Term

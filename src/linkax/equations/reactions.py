@@ -13,7 +13,7 @@ from linkax.equations.loop_rows import RowVectors, combined_rows, immobile_rows,
 from linkax.equations.loops import sorted_multipliers
 from linkax.equations.motion import Motion
 from linkax.equations.tree_sums import expand_to_motions, over_subtree, sum_by_body
-from linkax.model.forces import Load
+from linkax.model.forces.force import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross
 from linkax.tables import Table, among, by_axis, printed_as

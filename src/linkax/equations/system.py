@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from linkax.equations.structure import Structure, structure_of
-from linkax.model.constraints import AbstractConstraint
+from linkax.model.constraints.constraint import AbstractConstraint
 from linkax.model.joints.joint import RelativeMotion
 from linkax.model.joints.table_joint import TableJoint
 from linkax.model.mechanism import Mechanism

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from linkax.model.bodies import AbstractBody, Frame, body_name
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load
+from linkax.model.forces.force import AbstractForce, Load
 from linkax.model.numbers import (
     Matrix,
     Number,

@@ -11,8 +11,8 @@ import numpy as np
 
 from linkax.model.beams import MASS_PLACES, Beam, BeamElasticity, FrameOnBeam
 from linkax.model.bodies import Frame, RigidBody
-from linkax.model.constraints import AbstractConstraint
-from linkax.model.forces import AbstractForce
+from linkax.model.constraints.constraint import AbstractConstraint
+from linkax.model.forces.force import AbstractForce
 from linkax.model.joints.bending import BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.fixed import Fixed
 from linkax.model.joints.joint import AbstractJoint, JointKind

@@ -9,13 +9,13 @@ import equinox as eqx
 
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
-from linkax.model.constraints import AbstractConstraint, LinearConstraint
+from linkax.model.constraints.constraint import AbstractConstraint, LinearConstraint
 from linkax.model.description import described
 from linkax.model.discretisation import Parts, discretise_beams, is_split, split_cuts, tree_joints_first
 from linkax.model.elements import is_own
-from linkax.model.forces import AbstractForce, given_name
+from linkax.model.forces.force import AbstractForce, given_name
+from linkax.model.forces.internal_states import checked_states
 from linkax.model.immobile_rows import split_rows
-from linkax.model.internal_states import checked_states
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint

@@ -7,8 +7,8 @@ cell. All raise `ValueError` for an unknown name, and for the solution of a batc
 
 import numpy as np
 
-from linkax.model.constraints import Drive
-from linkax.model.ropes import Rope
+from linkax.model.constraints.constraint import Drive
+from linkax.model.constraints.ropes import Rope
 from linkax.plot.figure import Figure
 from linkax.scenery.colours import BLUE, GREEN, INK, VERMILION, body_colour
 from linkax.scenery.scenery import reached

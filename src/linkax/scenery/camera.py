@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from linkax.model.forces import Gravity
+from linkax.model.forces.force import Gravity
 from linkax.model.mechanism import Mechanism
 
 NEGLIGIBLE = 1e-9  # extent, relative to the largest, up to which there is none

@@ -12,13 +12,13 @@ from scipy.interpolate import CubicSpline
 
 from linkax.equations.coordinates import rates
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
+from linkax.model.constraints.ropes import ElasticRope, Rope
+from linkax.model.forces.point_forces import BetweenPoints, Spring
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import require_type
-from linkax.model.point_forces import BetweenPoints, Spring
-from linkax.model.ropes import ElasticRope, Rope
 from linkax.scenery.camera import Camera, camera_for
 from linkax.simulation.read.by_name import BodyPoint
 from linkax.simulation.read.kinematics import Kinematics

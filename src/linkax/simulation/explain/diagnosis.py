@@ -18,7 +18,7 @@ from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.saddle_inverse import invert
-from linkax.model.constraints import Drive
+from linkax.model.constraints.constraint import Drive
 from linkax.simulation.integrate.results import RESULTS, Solution
 from linkax.simulation.start.initial_state import MOVES, moving_joints
 from linkax.xla.arrays import Array, Scalar

@@ -16,7 +16,7 @@ from linkax.equations.motion import move
 from linkax.equations.system import system_of
 from linkax.linalg.spectral_radius import spectral_radius
 from linkax.linalg.triangular import cholesky_inverse
-from linkax.model.internal_states import shapes_of, size_of
+from linkax.model.forces.internal_states import shapes_of, size_of
 from linkax.simulation.explain.diagnosis import lost_inertia
 from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS, Solution
 from linkax.simulation.integrate.rosenbrock import Rodas5P

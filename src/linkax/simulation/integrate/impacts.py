@@ -17,8 +17,8 @@ from linkax.equations.coordinates import rates
 from linkax.equations.system import System
 from linkax.formulations.formulation import linear_system
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.model.forces import has_switch
-from linkax.model.impacts import Impact
+from linkax.model.forces.force import has_switch
+from linkax.model.forces.impacts import Impact
 from linkax.model.mechanism import Mechanism
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio

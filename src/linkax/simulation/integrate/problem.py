@@ -14,7 +14,7 @@ from linkax.equations.internal_states import bound, internal_rates, num_states
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation
-from linkax.model.internal_states import scales
+from linkax.model.forces.internal_states import scales
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack

@@ -20,7 +20,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.motion import Motion, move
 from linkax.equations.system import System
 from linkax.model.elements import Time
-from linkax.model.forces import AbstractForce, Load, has_switch
+from linkax.model.forces.force import AbstractForce, Load, has_switch
 from linkax.simulation.integrate import impacts
 from linkax.xla.arrays import Array
 

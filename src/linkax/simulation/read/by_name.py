@@ -14,8 +14,8 @@ from jaxtyping import Float, Int, Shaped
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.model.beams import Beam
 from linkax.model.elements import AbstractElement
-from linkax.model.forces import AbstractForce
-from linkax.model.internal_states import by_name, size_of
+from linkax.model.forces.force import AbstractForce
+from linkax.model.forces.internal_states import by_name, size_of
 from linkax.model.joints.distance import Distance
 from linkax.model.names import ByName, find
 from linkax.model.numbers import Number, Vector, number, one_of, real

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from linkax.equations.reactions import Axes, Reaction, Side
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.elements import AbstractElement
-from linkax.model.forces import AbstractForce
-from linkax.model.impacts import Impact
+from linkax.model.forces.force import AbstractForce
+from linkax.model.forces.impacts import Impact
 from linkax.model.joints.distance import Distance
 from linkax.model.mechanism import Mechanism
 from linkax.model.names import ByName, find

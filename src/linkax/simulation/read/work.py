@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from linkax.model.impacts import Impact
+from linkax.model.forces.impacts import Impact
 from linkax.model.names import ByName
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.interpolation import motion_between

@@ -11,7 +11,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
 from linkax.equations.gaps import gaps
 from linkax.linalg.saddle_inverse import invert
-from linkax.model.internal_states import initial_values
+from linkax.model.forces.internal_states import initial_values
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, whole_number
 from linkax.simulation.start.assembly import AssemblyWarning, assemble, demand_of

@@ -11,7 +11,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, on_manifold
 from linkax.equations.gaps import gaps
 from linkax.equations.system import system_of
-from linkax.model.internal_states import initial_values
+from linkax.model.forces.internal_states import initial_values
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number
 from linkax.simulation.start.branch_speeds import other_speeds, smallest_speeds, speeds_again, speeds_on_branch

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 from linkax.equations.gaps import Gap
 from linkax.equations.system import system_of
 from linkax.formulations.constraint_split import ConstraintSplit
-from linkax.model.constraints import Drive
+from linkax.model.constraints.constraint import Drive
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.initial_state import ON_BRANCH, moving_joints

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from linkax.model.elements import is_own
+from linkax.model.forces.internal_states import initial_values
 from linkax.model.functions import Law
-from linkax.model.internal_states import initial_values
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import Number, Vector, is_finite, namespace, number, real, require, require_type
 from linkax.model.poses import Pose, Velocity

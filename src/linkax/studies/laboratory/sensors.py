@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float
 
-from linkax.model.forces import Gravity
+from linkax.model.forces.force import Gravity
 from linkax.model.joints.distance import Distance
 from linkax.model.numbers import (
     is_finite,

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame, Frame
-from linkax.model.contact import SurfaceContact, velocity_at
-from linkax.model.contact_law import ContactLaw
 from linkax.model.elements import Configuration, Motion
+from linkax.model.forces.contact import SurfaceContact, velocity_at
+from linkax.model.forces.contact_law import ContactLaw
+from linkax.model.forces.shapes import Spot
+from linkax.model.forces.wheel_rail import Profile, WheelRailPair
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, Vector, positive, require_type, zero_or_more
-from linkax.model.shapes import Spot
-from linkax.model.wheel_rail import Profile, WheelRailPair
 from linkax.spatial.vectors import cross, dot
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import positive_or_one

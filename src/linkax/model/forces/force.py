@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from linkax.model.bodies import Frame
 from linkax.model.elements import AbstractElement, Configuration, Motion, System, Time
+from linkax.model.forces.internal_states import InternalState, States, by_name, joined_rates, shapes_of
 from linkax.model.functions import MISTAKES, of_element
-from linkax.model.internal_states import InternalState, States, by_name, joined_rates, shapes_of
 from linkax.model.numbers import Vector, number
 from linkax.xla.arrays import Array, Scalar
 

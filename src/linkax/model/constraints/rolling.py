@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from linkax.model.attached import Attached, Moving
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
-from linkax.model.constraints import AbstractConstraint, checked_name
+from linkax.model.constraints.constraint import AbstractConstraint, checked_name
 from linkax.model.numbers import Number, positive
 from linkax.spatial.vectors import dot, length
 from linkax.xla.arrays import Array, Scalar

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load
+from linkax.model.forces.force import AbstractForce, Load
 from linkax.model.functions import Law, evaluated, number_or_law
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, number, positive, zero_or_more

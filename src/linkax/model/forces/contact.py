@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
-from linkax.model.contact_law import ContactLaw
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load, described, named
+from linkax.model.forces.contact_law import ContactLaw
+from linkax.model.forces.force import AbstractForce, Load, described, named
+from linkax.model.forces.shapes import Shape, ShapePair, Spot
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, positive, require_type
-from linkax.model.shapes import Shape, ShapePair, Spot
 from linkax.spatial.vectors import cross, dot, length
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio

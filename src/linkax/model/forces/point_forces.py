@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from linkax.model.bodies import GROUND_NAME, BodyOrFrame, Frame, frame_of
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load, described, named
+from linkax.model.forces.force import AbstractForce, Load, described, named
 from linkax.model.functions import Law, evaluated, number_or_law
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, Vector, number, one_of, zero_or_more

@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from linkax.model.attached import Attached
 from linkax.model.bodies import AbstractBody, BodyOrFrame, Frame, frame_of
-from linkax.model.constraints import AbstractConstraint, checked_name
+from linkax.model.constraints.constraint import AbstractConstraint, checked_name
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load
+from linkax.model.forces.force import AbstractForce, Load
 from linkax.model.functions import Law, evaluated
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, listed, positive, zero_or_more

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from linkax.model.contact_law import ContactLaw
 from linkax.model.elements import Configuration, Motion
-from linkax.model.joint_forces import AlongJoint
+from linkax.model.forces.contact_law import ContactLaw
+from linkax.model.forces.joint_forces import AlongJoint
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, number, numbers_of, require, require_type
 from linkax.model.terms import Term, TermLike, term

@@ -6,10 +6,10 @@ from typing import Any
 import equinox as eqx
 
 from linkax.model.elements import Motion
-from linkax.model.forces import AbstractForce, Load
+from linkax.model.forces.force import AbstractForce, Load
+from linkax.model.forces.internal_states import InternalState, States
+from linkax.model.forces.joint_forces import AlongJoint
 from linkax.model.functions import Law, evaluated, number_or_law
-from linkax.model.internal_states import InternalState, States
-from linkax.model.joint_forces import AlongJoint
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, number, positive, require_type
 from linkax.model.terms import TermLike, term

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 
 from linkax.model.bodies import BodyOrFrame
 from linkax.model.elements import Configuration, Motion
+from linkax.model.forces.internal_states import InternalState, States
+from linkax.model.forces.joint_forces import AlongJoint
+from linkax.model.forces.point_forces import BetweenPoints, two_points
 from linkax.model.functions import Law, evaluated, number_or_law
-from linkax.model.internal_states import InternalState, States
-from linkax.model.joint_forces import AlongJoint
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, number, positive, require, zero_or_more
-from linkax.model.point_forces import BetweenPoints, two_points
 from linkax.model.terms import TermLike, term
 from linkax.xla.arrays import Scalar
 

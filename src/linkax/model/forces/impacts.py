@@ -6,11 +6,11 @@ import equinox as eqx
 
 from linkax.model.bodies import Frame
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces import AbstractForce, Load
-from linkax.model.joint_limits import JointRange
+from linkax.model.forces.force import AbstractForce, Load
+from linkax.model.forces.joint_limits import JointRange
+from linkax.model.forces.shapes import Shape, ShapePair
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, number, positive, require
-from linkax.model.shapes import Shape, ShapePair
 from linkax.model.terms import Term, TermLike
 from linkax.xla.arrays import Scalar
 

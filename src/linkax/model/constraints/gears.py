@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from linkax.model.attached import Attached
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
-from linkax.model.constraints import AbstractConstraint, checked_name
+from linkax.model.constraints.constraint import AbstractConstraint, checked_name
 from linkax.model.numbers import Number, positive, require_bool, whole_number
 from linkax.spatial.vectors import cross, dot
 from linkax.xla.arrays import Array, Scalar

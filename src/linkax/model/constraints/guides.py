@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from linkax.model.attached import Attached
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
-from linkax.model.constraints import AbstractConstraint, checked_name
+from linkax.model.constraints.constraint import AbstractConstraint, checked_name
 from linkax.model.functions import Law
 from linkax.model.numbers import Number, Vector
 from linkax.xla.arrays import Array, Scalar

@@ -1,0 +1,1 @@
+"""Constraints by their residuals: drives, couplings, ropes, gears, guides, rolling."""

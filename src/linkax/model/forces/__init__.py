@@ -1,0 +1,1 @@
+"""Force elements: springs, actuators, contact, stops, and their internal states."""
