@@ -124,6 +124,12 @@ class Motion(eqx.Module):
         body = self.configuration.body(frame.body)
         return self.velocity[body] + cross(self.angular_velocity[body], self.configuration.arm(frame))
 
+    def velocity_at(self, body: BodyOrFrame, place: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Velocity of what is at a place on a body, given from the frame's origin in ground axes [m/s]."""
+        frame = frame_of(body, "body")
+        index = self.configuration.body(frame.body)
+        return self.velocity[index] + cross(self.angular_velocity[index], self.configuration.arm(frame) + place)
+
     def point_load(self, point: BodyOrFrame, force: Real[Array, "3"], moment: Real[Array, "3"] | float = 0.0) -> Load:
         """Make the load of a force at a point, and a moment, in ground axes [N, N m]; none on the ground."""
         return self.configuration.point_load(frame_of(point, "point"), force, moment)

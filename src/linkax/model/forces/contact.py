@@ -15,7 +15,7 @@ from linkax.model.forces.force import AbstractForce, Load, described, named
 from linkax.model.forces.shapes import Shape, ShapePair, Spot
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, positive, require_type
-from linkax.spatial.vectors import cross, dot, length
+from linkax.spatial.vectors import dot, length
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
 
@@ -37,7 +37,7 @@ class SurfaceContact(AbstractForce):
 
     def _approach(self, motion: Motion, spot: Spot) -> tuple[Float[jax.Array, "3"], Scalar]:
         """The velocity of the first surface seen from the second, and the rate at which penetration grows [m/s]."""
-        velocities = [velocity_at(motion, frame, arm) for frame, arm in zip(self.sides, spot.arms, strict=True)]
+        velocities = [motion.velocity_at(frame, arm) for frame, arm in zip(self.sides, spot.arms, strict=True)]
         velocity = velocities[0] - velocities[1]
         return velocity, -dot(spot.normal, velocity)
 
@@ -83,12 +83,6 @@ class SurfaceContact(AbstractForce):
     def potential_energy(self, configuration: Configuration) -> Scalar:
         energies = [self.law.energy(-spot.gap) for spot in self.spots(configuration)]
         return sum(energies, jnp.zeros((), configuration.system.dtype))
-
-
-def velocity_at(motion: Motion, frame: Frame, arm: Float[Array, "3"]) -> Float[jax.Array, "3"]:
-    """Compute the velocity of the body of a frame at a place, by the arm from the frame's origin [m/s]."""
-    body = motion.configuration.body(frame.body)
-    return motion.velocity[body] + cross(motion.angular_velocity[body], motion.configuration.arm(frame) + arm)
 
 
 class Contact(SurfaceContact):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame, Frame
 from linkax.model.elements import Configuration, Motion
-from linkax.model.forces.contact import SurfaceContact, velocity_at
+from linkax.model.forces.contact import SurfaceContact
 from linkax.model.forces.contact_law import ContactLaw
 from linkax.model.forces.shapes import Spot
 from linkax.model.forces.wheel_rail import Profile, WheelRailPair
@@ -182,7 +182,7 @@ class WheelRailContact(SurfaceContact):
         across = cross(spot.normal, along)
         turns = [motion.angular_velocity[motion.configuration.body(frame.body)] for frame in (wheel, rail)]
         # The place of contact goes along with the wheel's centre, past both surfaces.
-        passed = motion.point_velocity(wheel) - velocity_at(motion, rail, spot.arms[1]) - velocity / 2.0
+        passed = motion.point_velocity(wheel) - motion.velocity_at(rail, spot.arms[1]) - velocity / 2.0
         slip = jnp.stack([dot(velocity, along), dot(velocity, across), dot(turns[0] - turns[1], spot.normal)])
         pull, push, moment = self.creep.force(normal, dot(passed, along), slip)
         return pull * along + push * across, moment * spot.normal
