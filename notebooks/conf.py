@@ -41,6 +41,7 @@ CALLED = {
     "Beam",
     "Fit",
     "Linearisation",
+    "Machine",
     "Mechanism",
     "Mobility",
     "Motion",

@@ -14,7 +14,7 @@ LAYERS = ["files", "xla", "tables", "straight_line", "spatial", "model", "linalg
 LAYERS += [f"simulation.{room}" for room in ("start", "integrate", "explain", "read", "simulate")]
 LAYERS += ["analysis"]
 LAYERS += [f"studies.{room}" for room in ("parameters", "laboratory", "fits", "sweeps", "tolerances", "synthesis")]
-LAYERS += ["scenes", "scenery", "view", "plot", "cli"]
+LAYERS += ["machines", "scenes", "scenery", "view", "plot", "cli"]
 # Methods that hand on to a higher layer, which they import when they are called.
 HAND_ON = {
     ("linkax.model.mechanism", "linkax.simulation.read.solution"),

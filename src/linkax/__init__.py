@@ -46,6 +46,12 @@ from linkax.formulations.moore_penrose import MoorePenrose as MoorePenrose  # no
 from linkax.formulations.projection_operator import ProjectionOperator as ProjectionOperator  # noqa: E402
 from linkax.formulations.tangent_space import TangentSpace as TangentSpace  # noqa: E402
 from linkax.linalg.pivoted_qr import pivoted_qr as pivoted_qr  # noqa: E402
+from linkax.machines.draft import LeftOutWarning as LeftOutWarning  # noqa: E402
+from linkax.machines.load import load as load  # noqa: E402
+from linkax.machines.machine import LeftOut as LeftOut  # noqa: E402
+from linkax.machines.machine import Machine as Machine  # noqa: E402
+from linkax.machines.machine import Start as Start  # noqa: E402
+from linkax.machines.xml import MachineFileError as MachineFileError  # noqa: E402
 from linkax.model.attached import Attached as Attached  # noqa: E402
 from linkax.model.attached import Moving as Moving  # noqa: E402
 from linkax.model.beams import Beam as Beam  # noqa: E402

@@ -1,0 +1,1 @@
+"""Machines from files, as data that can be looked at and changed."""

@@ -1,0 +1,279 @@
+"""What the readers of all formats share: they fill a draft, which becomes a machine."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from linkax.machines.machine import LeftOut, Machine, Start
+from linkax.machines.parts import Part, Place, ground
+from linkax.machines.poses import relative, turned
+from linkax.machines.xml import MachineFileError, Where
+from linkax.model.bodies import GROUND_NAME, RigidBody
+from linkax.model.forces.contact_law import ContactLaw
+from linkax.model.forces.force import Gravity
+from linkax.model.forces.joint_forces import JointDamper, JointFriction, JointSpring
+from linkax.model.forces.joint_limits import JointLimit
+from linkax.model.forces.point_forces import PointForce
+from linkax.model.joints.fixed import Fixed
+from linkax.model.joints.free import Free
+from linkax.xla.users_line import warn
+
+Pose = Float[np.ndarray, "4 4"]
+STOP_DEPTH = 1e-3  # how far the weight of a machine presses a stop whose stiffness no file gives [rad or of its size]
+STOP_RESTITUTION = 0.1  # of such a stop, hit with 1 rad/s, or one size a second
+FRICTION_SPEED = 1e-2  # below which dry friction along a joint is nearly viscous [rad/s, or of the size a second]
+SHOWN = 4  # things left out that a warning names
+
+
+@dataclasses.dataclass
+class Draft:
+    """A machine in the making.
+
+    - `ignore`: kinds of things that are left out where the file has them.
+    - `folders`: below which other files may be read.
+    """
+
+    path: Path
+    ignore: tuple[str, ...]
+    folders: tuple[Path, ...]
+    name: str = ""
+    bodies: list[Part] = dataclasses.field(default_factory=list)
+    joints: list[Part] = dataclasses.field(default_factory=list)
+    forces: list[Part] = dataclasses.field(default_factory=list)
+    constraints: list[Part] = dataclasses.field(default_factory=list)
+    poses: dict[str, Pose] = dataclasses.field(default_factory=lambda: {GROUND_NAME: np.eye(4)})
+    starts: dict[str, Start] = dataclasses.field(default_factory=dict)
+    left_out: list[LeftOut] = dataclasses.field(default_factory=list)
+    missing: list[LeftOut] = dataclasses.field(default_factory=list)
+    _taken: set[tuple[int, str]] = dataclasses.field(default_factory=set)
+
+    def leave_out(self, where: Where, kind: str, reason: str, changes_motion: bool = True) -> None:
+        """Note what is left out; what changes the motion must be in `ignore`."""
+        known = self.missing if changes_motion and kind not in self.ignore else self.left_out
+        known.append(LeftOut(where, kind, reason))
+
+    def ignores(self, kind: str, where: Where, what: str) -> bool:
+        """Tell whether a kind of thing that could be modelled is to be left out, and note that."""
+        if kind in self.ignore:
+            self.left_out.append(LeftOut(where, kind, f"{what} is ignored as asked"))
+        return kind in self.ignore
+
+    def body(
+        self,
+        name: str,
+        pose: Pose,
+        mass: float,
+        center_of_mass: Float[np.ndarray, "3"],
+        inertia: Float[np.ndarray, "3 3"],
+        where: Where,
+        frames: dict[str, Any] | None = None,
+    ) -> None:
+        """Add a body, from its pose in the world as drawn, and its numbers in its own frame."""
+        if name in self.poses:
+            raise where.error(f"body {name!r} is there twice; give each a name of its own")
+        self.poses[name] = pose
+        inertia = self._possible(inertia, where)
+        arguments = {"name": name, "mass": float(mass), "center_of_mass": center_of_mass, "inertia": inertia}
+        self._add(self.bodies, RigidBody, arguments | ({"frames": frames} if frames else {}), where)
+
+    def _possible(self, inertia, where):
+        """The inertia, with a largest moment no larger than the sum of the others, as every body has it."""
+        moments, axes = np.linalg.eigh(inertia)
+        most = moments[0] + moments[1]
+        if moments[0] < 0.0 or moments[2] <= most * (1.0 + 1e-9) + 1e-12 * moments[2]:
+            return inertia
+        reason = f"of its principal moments {moments} kg m² the largest exceeds the sum of the others; reduced to that"
+        self.leave_out(where, "inertia", reason)
+        return turned(np.diag([moments[0], moments[1], most]), axes)
+
+    def joint(
+        self, kind: type, name: str, parent: str, child: str, frame: Pose, where: Where, **arguments: Any
+    ) -> None:
+        """Add a joint between two bodies, with its frame in the world as drawn."""
+        for body in (parent, child):
+            if body not in self.poses:
+                raise where.error(f"it attaches to {body!r}, which is no body of the file; known: {self._names()}")
+        places = {
+            end: Place.at(body, relative(frame, self.poses[body]))
+            for end, body in (("parent", parent), ("child", child))
+        }
+        self.joint_at(kind, name, places["parent"], places["child"], where, **arguments)
+
+    def joint_at(self, kind: type, name: str, parent: Place, child: Place, where: Where, **arguments: Any) -> None:
+        """Add a joint from its places on both bodies."""
+        self._add(self.joints, kind, {"name": name, "parent": parent, "child": child, **arguments}, where)
+
+    def force(self, kind: type, name: str, where: Where, **arguments: Any) -> None:
+        """Add a force element."""
+        self._add(self.forces, kind, {"name": name, **arguments}, where)
+
+    def constraint(self, kind: type, name: str, where: Where, **arguments: Any) -> None:
+        """Add a constraint."""
+        self._add(self.constraints, kind, {"name": name, **arguments}, where)
+
+    def gravity(self, acceleration: Any, where: Where) -> None:
+        """Add gravity [m/s²], (3,)."""
+        if np.any(acceleration):
+            arguments = {"acceleration": np.asarray(acceleration, dtype=float)}
+            self.forces.insert(0, _Gravity(Gravity, arguments, where))
+
+    def carry(self, body: str, center_of_mass: Any, force: Any, where: Where) -> None:
+        """Add a constant force [N] at the centre of mass, in ground axes, against the weight of a body."""
+        point = Place(body, np.asarray(center_of_mass), np.eye(3))
+        self.force(PointForce, f"{body}.carried", where, point=point, force=np.asarray(force))
+
+    def along(
+        self,
+        joint: Any,
+        name: str,
+        where: Where,
+        *,
+        stiffness: float = 0.0,
+        free: float = 0.0,
+        damping: float = 0.0,
+        friction: float = 0.0,
+    ) -> None:
+        """Add spring, damper and dry friction along a joint, as far as they are not zero."""
+        if stiffness and not self.ignores("spring", where, "its spring"):
+            self.force(JointSpring, f"{name}.spring", where, joint=joint, stiffness=stiffness, free=free)
+        if damping and not self.ignores("damping", where, "its damping"):
+            self.force(JointDamper, f"{name}.damper", where, joint=joint, damping=damping)
+        if friction and not self.ignores("friction", where, "its dry friction"):
+            self.force(JointFriction, f"{name}.friction", where, joint=joint, torque=friction, scale=None)
+
+    def limit(
+        self,
+        joint: Any,
+        name: str,
+        where: Where,
+        lower: float | None,
+        upper: float | None,
+        *,
+        stiffness: float | None = None,
+        damping: float | None = None,
+    ) -> None:
+        """Add stops, where a joint has ends and the first is below the second."""
+        if (lower is None and upper is None) or self.ignores("limit", where, "its range"):
+            return
+        if lower is not None and upper is not None and lower >= upper:
+            self.leave_out(where, "limit", f"its range from {lower:g} to {upper:g} is empty", False)
+            return
+        ends = {end: value for end, value in (("lower", lower), ("upper", upper)) if value is not None}
+        law = {"stiffness": stiffness, "exponent": 1.0, "damping": damping}
+        self.force(JointLimit, f"{name}.limit", where, joint=joint, law=Part(ContactLaw, law, where), **ends)
+
+    def machine(self, base: str) -> Machine:
+        """Make the machine: bodies that nothing holds get a joint to the ground, a free or a fixed one.
+
+        **Raises:** `MachineFileError` for what the file asks for, changes the motion, and is not in `ignore`.
+        """
+        if self.missing:
+            listed = "\n  ".join(map(str, self.missing))
+            kinds = ", ".join(f'"{kind}"' for kind in dict.fromkeys(item.kind for item in self.missing))
+            raise MachineFileError(
+                f"{self.path.name} asks for what linkax does not model, and what changes the motion:\n  {listed}\n"
+                f"leave it out by ignore=[{kinds}]"
+            )
+        if not self.bodies:
+            raise MachineFileError(f"{self.path.name} has no body; give a file of a machine")
+        self._hold(base)
+        joints = {part.name: part for part in self.joints}
+        forces = [self._completed(part, joints) for part in self.forces]
+        for part in (*self.bodies, *self.joints, *forces, *self.constraints):
+            part.built({})
+        groups = tuple(self.bodies), tuple(self.joints), tuple(forces), tuple(self.constraints)
+        self._warn()
+        return Machine(self.name or self.path.stem, self.path, *groups, self.starts, tuple(self.left_out))
+
+    def _add(self, group, kind, arguments, where):
+        taken = (id(group), arguments["name"])
+        if taken in self._taken:
+            raise where.error(f"the name {arguments['name']!r} is there twice; give each element a name of its own")
+        self._taken.add(taken)
+        group.append(Part(kind, arguments, where))
+
+    def _names(self) -> str:
+        return ", ".join(map(repr, list(self.poses)[1:9])) + (", ..." if len(self.poses) > 9 else "")
+
+    def _hold(self, base):
+        """Join to the ground the first body of each part that nothing holds there."""
+        reached = _connected(self.joints, GROUND_NAME)
+        for body in self.bodies:
+            if body.name in reached:
+                continue
+            kind, word = (Free, "free") if base == "free" else (Fixed, "fixed")
+            pose, child = self.poses[body.name], Place.at(body.name, np.eye(4))
+            self.joints.insert(
+                0, Part(kind, {"name": f"{body.name}.{word}", "parent": ground(pose), "child": child}, body.where)
+            )
+            reached |= _connected(self.joints, body.name)
+
+    @property
+    def size(self) -> float:
+        """How far apart its joints are drawn, at most [m]; 1 for a machine without extent."""
+        origins = [self.poses[place.body][:3] @ [*place.offset, 1.0] for joint in self.joints for place in _ends(joint)]
+        return float(np.ptp(origins, axis=0).max()) or 1.0 if origins else 1.0
+
+    def _completed(self, part, joints):
+        """A stop, or dry friction, with the numbers that the file does not give."""
+        if part.kind not in (JointLimit, JointFriction):
+            return part
+        along = part.arguments["joint"]
+        name, index = along if isinstance(along, tuple) else (along, 0)
+        unit = self.size if joints[name].kind.speed_units[index] == "m" else 1.0
+        arguments = dict(part.arguments)
+        if part.kind is JointFriction:
+            return dataclasses.replace(part, arguments=arguments | {"scale": FRICTION_SPEED * unit})
+        law = dict(arguments["law"].arguments)
+        if law["stiffness"] is None:
+            weight = 9.81 * self.size * sum(body.arguments["mass"] for body in self.bodies) or 1.0
+            law["stiffness"] = weight / STOP_DEPTH / unit**2
+        if law.pop("damping") is None:
+            law |= {"restitution": STOP_RESTITUTION, "impact_speed": unit}
+        return dataclasses.replace(
+            part, arguments=arguments | {"law": dataclasses.replace(arguments["law"], arguments=law)}
+        )
+
+    def _warn(self):
+        changing = [item for item in self.left_out if item.kind in self.ignore]
+        if not self.left_out:
+            return
+        shown = (changing or self.left_out)[:SHOWN]
+        more = len(self.left_out) - len(shown)
+        rest = f"; {more} more in machine.left_out" if more else ""
+        warn(f"{self.path.name}: left out {'; '.join(map(str, shown))}{rest}", LeftOutWarning)
+
+
+class LeftOutWarning(UserWarning):
+    """A file asks for something that the machine does not have; see `linkax.Machine.left_out`."""
+
+
+class _Gravity(Part):
+    """Gravity, which has no name in linkax."""
+
+    @property
+    def name(self) -> str:
+        return "gravity"
+
+
+def _ends(joint: Part) -> Sequence[Place]:
+    return joint.arguments["parent"], joint.arguments["child"]
+
+
+def _connected(joints: Iterable[Part], body: str) -> set[str]:
+    """The names of all bodies that joints connect with one."""
+    neighbours: dict[str, set[str]] = {}
+    for joint in joints:
+        first, second = (place.body for place in _ends(joint))
+        neighbours.setdefault(first, set()).add(second)
+        neighbours.setdefault(second, set()).add(first)
+    found, open_ones = {body}, [body]
+    while open_ones:
+        fresh = neighbours.get(open_ones.pop(), set()) - found
+        found |= fresh
+        open_ones += fresh
+    return found

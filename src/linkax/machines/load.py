@@ -1,0 +1,80 @@
+"""Read a machine from a file, by its format."""
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Literal
+
+from linkax.machines.draft import Draft
+from linkax.machines.machine import Machine
+from linkax.machines.sdf import read_sdf
+from linkax.machines.urdf import close_by_yaml, read_urdf
+from linkax.machines.xml import Node, read_xml
+from linkax.model.numbers import listed, one_of
+
+Base = Literal["free", "fixed"]
+READERS: dict[str, tuple[Callable[[Node, Draft], None], Base]] = {
+    "robot": (read_urdf, "fixed"),
+    "sdf": (read_sdf, "free"),
+}
+USD = (".usd", ".usda", ".usdc", ".usdz")
+
+
+def load(
+    path: str | os.PathLike[str],
+    *,
+    ignore: Iterable[str] = ("contact",),
+    base: Base | None = None,
+    closures: str | os.PathLike[str] | None = None,
+    folders: Iterable[str | os.PathLike[str]] = (),
+) -> Machine:
+    """Read a machine from a file: MJCF, SDF or URDF, with its closed loops.
+
+    ```python
+    machine = lx.load("gripper.xml")
+    gripper = machine.mechanism({"forces": {"finger.spring": {"stiffness": 0.4}}})
+    state = lx.assemble(gripper, {"left_driver": 0.3})
+    ```
+
+    Loops are found, whatever the file says of the tree: SDF and URDF may give a link several parents, URDF also the
+    elements <loop>, <coupling> and <constraint>, MJCF <equality>, whose two <connect> between the same bodies make a
+    hinge. Coordinates are zero where the machine stands as drawn.
+
+    What linkax does not model is in `Machine.left_out`, and a warning (`LeftOutWarning`) names some of it. Where that
+    changes the motion it must be in `ignore`. Stops and dry friction have laws of linkax: where the file does not say
+    how stiff a stop is, the weight of the machine at its size presses it by 0.001 rad; dry friction is nearly viscous
+    below 0.01 rad/s. Both are in `Machine.params`.
+
+    XML is read without entities; other files are read only below the folder of the file.
+
+    **Arguments:**
+
+    - `path`: of the file. MJCF needs MuJoCo (`pip install "linkax[files]"`), which reads it.
+    - `ignore`: kinds of things to leave out. By default "contact", between any shapes; also "limit", "spring",
+      "damping", "friction" and "actuator", which linkax has, and what an error names.
+    - `base`: "free" or "fixed": how the first body of what nothing joins to the ground moves. By default "free" in
+      SDF, "fixed" in URDF and MJCF.
+    - `closures`: for URDF, a YAML file of pairs of links that coincide: `closed_loop: [[a, b], ...]`, with
+      `type: [3d, ...]` for points, or 6d.
+    - `folders`: further ones below which files may be read, such as those of meshes.
+
+    **Raises:** `MachineFileError`, a `ValueError`, with file, line and element: for a file that cannot be read, and for
+    what changes the motion, is not modelled, and not in `ignore`.
+    """
+    path = Path(path)
+    ignored = (ignore,) if isinstance(ignore, str) else listed(ignore, str, "ignore", 'give words such as ["contact"]')
+    draft = Draft(path, tuple(ignored), (path.parent, *map(Path, folders)))
+    usual = _read(draft)
+    if closures is not None:
+        close_by_yaml(draft, Path(closures))
+    return draft.machine(usual if base is None else one_of(base, ("free", "fixed"), "base"))
+
+
+def _read(draft: Draft) -> Base:
+    """Fill a draft, and return how a base moves that the format does not join to the ground."""
+    root = read_xml(draft.path)
+    if root.tag not in READERS:
+        raise root.where.error(f"the file is no machine; it must begin with {', '.join(f'<{tag}>' for tag in READERS)}")
+    reader, base = READERS[root.tag]
+    reader(root, draft)
+    return base

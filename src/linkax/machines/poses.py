@@ -1,0 +1,57 @@
+"""Poses as homogeneous matrices, (4, 4), from the angles and quaternions of files."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+ROUNDING = 1e-15  # entries of a rotation that are as near to 0, 1 or −1 as that are meant to be it
+
+
+def pose(
+    position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"] | None = None
+) -> Float[np.ndarray, "4 4"]:
+    """Make a pose from the origin [m] and the axes as columns."""
+    found = np.eye(4)
+    found[:3, 3] = position
+    if rotation is not None:
+        found[:3, :3] = rotation
+    return found
+
+
+def from_angles(roll_pitch_yaw: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """R_z(yaw) R_y(pitch) R_x(roll), as URDF and SDF turn."""
+    return exact(Rotation.from_euler("xyz", roll_pitch_yaw).as_matrix())
+
+
+def from_quaternion(w_x_y_z: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation of a quaternion, (w, x, y, z), of any length but zero."""
+    return exact(Rotation.from_quat(w_x_y_z, scalar_first=True).as_matrix())
+
+
+def to_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    """The quaternion (w, x, y, z) of a rotation, with w ≥ 0."""
+    return Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+
+
+def exact(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """A rotation without rounding in entries that are 0, 1 or −1, which cost no operation then."""
+    near = np.round(rotation)
+    return np.where(np.abs(rotation - near) < ROUNDING, near, rotation) + 0.0
+
+
+def inverse(of: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The inverse of a pose."""
+    return pose(-of[:3, :3].T @ of[:3, 3], of[:3, :3].T)
+
+
+def relative(of: Float[np.ndarray, "4 4"], seen_from: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """A pose seen from another one."""
+    found = inverse(seen_from) @ of
+    found[:3, :3] = exact(found[:3, :3])
+    return found
+
+
+def turned(inertia: Float[np.ndarray, "3 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """An inertia tensor in other axes, R I Rᵀ, symmetric to the last digit."""
+    found = rotation @ inertia @ rotation.T
+    return (found + found.T) / 2.0

@@ -1,0 +1,246 @@
+"""Read URDF, with what closes loops in it: joints with the same child, <loop>, <constraint>, <coupling>, YAML.
+
+The format: http://wiki.ros.org/urdf/XML. <loop> and <coupling> are of URDF+ (Chignoli, Slotine, Wensing, Kim, URDF+: An
+Enhanced URDF for Robots with Kinematic Loops, 2024); <constraint> is that proposed for urdfdom (pull request 264).
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from linkax.machines.draft import Draft, Pose
+from linkax.machines.parts import Place
+from linkax.machines.poses import from_angles, pose, turned
+from linkax.machines.xml import MachineFileError, Node, read_file
+from linkax.model.constraints.constraint import Coupling
+from linkax.model.joints.cylindrical import Cylindrical
+from linkax.model.joints.fixed import Fixed
+from linkax.model.joints.free import Free
+from linkax.model.joints.planar import Planar
+from linkax.model.joints.prismatic import Prismatic
+from linkax.model.joints.revolute import Revolute
+from linkax.model.joints.spherical import Spherical
+from linkax.model.joints.universal import Universal
+
+KINDS = {
+    "revolute": Revolute, "continuous": Revolute, "prismatic": Prismatic, "fixed": Fixed, "floating": Free,
+    "planar": Planar, "spherical": Spherical, "ball": Spherical, "universal": Universal, "cylindrical": Cylindrical,
+}  # fmt: skip
+WITH_AXIS = (Revolute, Prismatic, Planar, Cylindrical)
+GRAVITY = (0.0, 0.0, -9.81)  # of which the format says nothing
+SEEN_ONLY = ("visual", "material", "gazebo", "transmission", "sensor", "mujoco", "safety_controller", "calibration")
+ZERO = (0.0, 0.0, 0.0)
+OF_YAML = {"3d": Spherical, "6d": Fixed}
+
+
+def read_urdf(root: Node, draft: Draft) -> None:
+    """Fill a draft from the root of a URDF file, whose links stand as its tree of joints says.
+
+    **Raises:** `MachineFileError` for what the format does not allow, with line and remedy.
+    """
+    _Robot(root, draft).read()
+
+
+class _Robot:
+    """A robot that is read."""
+
+    def __init__(self, root: Node, draft: Draft) -> None:
+        self.root, self.draft = root, draft
+        self.links = {link.name: link for link in root.all("link")}
+        self.joints: dict[str, Node] = {}
+        self.carrier: dict[str, tuple[str, str]] = {}  # of a link: its parent in the tree of joints, and the joint
+
+    def read(self) -> None:
+        """Read links where the joints carry them, then joints, then what closes loops."""
+        root, draft = self.root, self.draft
+        draft.name = root.attributes.get("name", "")
+        draft.gravity(GRAVITY, root.where)
+        joints = root.all("joint")
+        for joint in joints:
+            child = self._link(joint, "child")
+            self.carrier.setdefault(child, (self._link(joint, "parent"), joint.name))
+        carried = {name for _, name in self.carrier.values()}
+        self.joints = {joint.name: joint for joint in joints}
+        for link in root.all("link"):
+            self._body(link)
+        for joint in joints:
+            self._joint(joint, joint.name in carried)
+        for node in root:
+            if node.tag == "loop":
+                ends = (self._end(node, "predecessor"), self._end(node, "successor", "sucessor"))
+                self._loop(node, *ends, {"axis": node.find("axis")})
+            elif node.tag == "constraint":
+                self._constraint(node)
+            elif node.tag == "coupling":
+                self._coupling(node)
+            elif node.tag not in ("link", "joint"):
+                known = node.tag in SEEN_ONLY
+                reason = f"<{node.tag}> does not move anything" if known else f"<{node.tag}> is not known"
+                draft.leave_out(node.where, node.tag, reason, not known)
+
+    def _link(self, node: Node, tag: str) -> str:
+        """The name of the link at one end."""
+        given = node.child(tag)
+        name = given.attributes.get("link") or given.attribute("name")
+        if name not in self.links:
+            raise given.where.error(f"{tag} is {name!r}, which is no link of the file")
+        return name
+
+    def _pose_of(self, link: str) -> Pose:
+        """The pose of a link as drawn, from the joints that carry it."""
+        way: list[str] = []
+        while link not in self.draft.poses and link in self.carrier:
+            if link in way:
+                raise self.links[link].where.error(f"its joints go in a circle: {' → '.join([*way, link])}")
+            way.append(link)
+            link = self.carrier[link][0]
+        found = self.draft.poses.get(link, np.eye(4))
+        for each in reversed(way):
+            found = found @ _origin(self.joints[self.carrier[each][1]].find("origin"))
+        return found
+
+    def _body(self, node: Node) -> None:
+        inertial = node.find("inertial")
+        mass, at, inertia = 0.0, np.eye(4), np.zeros((3, 3))
+        if inertial is not None:
+            at, mass = _origin(inertial.find("origin")), float(inertial.child("mass").numbers("value", 1)[0])
+            entry = lambda name: float(inertial.child("inertia").numbers(name, 1, [0.0])[0])
+            xx, yy, zz, xy, xz, yz = map(entry, ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+            inertia = turned(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), at[:3, :3])
+        self.draft.body(node.name, self._pose_of(node.name), mass, at[:3, 3], inertia, node.where)
+        for child in node:
+            if child.tag == "collision":
+                self.draft.leave_out(child.where, "contact", "contact of this shape with others")
+            elif child.tag != "inertial":
+                self.draft.leave_out(child.where, child.tag, f"<{child.tag}> does not move anything", False)
+
+    def _joint(self, node: Node, carries: bool) -> None:
+        draft, where, kind = self.draft, node.where, node.attribute("type")
+        if kind not in KINDS:
+            draft.leave_out(where, "joint", f"a joint of type {kind!r}; linkax reads {', '.join(KINDS)}")
+            return
+        arguments: dict[str, Any] = {} if carries else {"cut": True}
+        if KINDS[kind] in WITH_AXIS:
+            arguments["axis"] = _axis(node.find("axis"))
+        ends = (
+            Place.at(self._link(node, "parent"), _origin(node.find("origin"))),
+            Place.at(self._link(node, "child"), np.eye(4)),
+        )
+        draft.joint_at(KINDS[kind], node.name, *ends, where, **arguments)
+        if KINDS[kind] not in (Revolute, Prismatic):
+            return
+        if (dynamics := node.find("dynamics")) is not None:
+            damping, friction = (float(dynamics.numbers(name, 1, [0.0])[0]) for name in ("damping", "friction"))
+            draft.along(node.name, node.name, dynamics.where, damping=damping, friction=friction)
+        if (limit := node.find("limit")) is not None and kind != "continuous":
+            lower, upper = (float(limit.numbers(end, 1, [0.0])[0]) for end in ("lower", "upper"))
+            draft.limit(node.name, node.name, limit.where, lower, upper)
+        if (mimic := node.find("mimic")) is not None:
+            leader = mimic.attribute("joint")
+            if leader not in self.joints:
+                raise mimic.where.error(f"it follows {leader!r}, which is no joint of the file")
+            factor, offset = (
+                float(mimic.numbers(*given)[0]) for given in (("multiplier", 1, [1.0]), ("offset", 1, [0.0]))
+            )
+            coefficients = {node.name: 1.0, leader: -factor}
+            draft.constraint(Coupling, f"{node.name}.mimic", mimic.where, coefficients=coefficients, offset=offset)
+        for child in node:
+            if child.tag in SEEN_ONLY:
+                draft.leave_out(child.where, child.tag, f"<{child.tag}> is for controllers", False)
+
+    def _end(self, node: Node, *tags: str) -> Place:
+        """The place of one end of a <loop>."""
+        tag = next((tag for tag in tags if node.find(tag) is not None), tags[0])
+        return Place.at(self._link(node, tag), _origin(node.child(tag).find("origin")))
+
+    def _constraint(self, node: Node) -> None:
+        place = lambda end: Place.at(self._link(node, end), _origin(node.find(f"{end}_origin")))
+        self._loop(
+            node,
+            place("parent"),
+            place("child"),
+            {"axis": node.find("parent_axis"), "second_axis": node.find("child_axis")},
+        )
+
+    def _loop(self, node: Node, first: Place, second: Place, axes: Mapping[str, Node | None]) -> None:
+        """A joint that closes a loop, with its frame on both links."""
+        kind = node.attribute("type")
+        if kind not in KINDS:
+            self.draft.leave_out(node.where, node.tag, f"a loop of type {kind!r}; linkax reads {', '.join(KINDS)}")
+            return
+        arguments: dict[str, Any] = {"cut": True}
+        if KINDS[kind] in (*WITH_AXIS, Universal):
+            arguments["axis"] = _axis(axes["axis"])
+        if KINDS[kind] is Universal:
+            if axes.get("second_axis") is None:
+                raise node.where.error("a universal joint needs two axes; give <parent_axis> and <child_axis>")
+            arguments["second_axis"] = _axis(axes["second_axis"])
+        self.draft.joint_at(KINDS[kind], node.name, first, second, node.where, **arguments)
+
+    def _coupling(self, node: Node) -> None:
+        """θ of the successor = ratio × θ of the predecessor, both from the nearest link that carries the two."""
+        ratio = float(node.child("ratio").numbers("value", 1)[0])
+        ways = [self._way(self._link(node, end)) for end in ("predecessor", "successor")]
+        terms: dict[str, float] = {}
+        for way, other, factor in ((ways[0], ways[1], -ratio), (ways[1], ways[0], 1.0)):
+            for joint in way:
+                kind = KINDS.get(self.joints[joint].attribute("type"))
+                if joint in other or kind is Fixed:
+                    continue
+                if kind not in (Revolute, Prismatic):
+                    raise node.where.error(f"joint {joint!r} on the way has not one coordinate; couple other links")
+                terms[joint] = factor
+        self.draft.constraint(Coupling, node.name, node.where, coefficients=terms, offset=0.0)
+
+    def _way(self, link: str) -> list[str]:
+        """The joints that carry a link, from the base."""
+        way = []
+        while link in self.carrier:
+            link, joint = self.carrier[link]
+            way.append(joint)
+        return way
+
+
+def close_by_yaml(draft: Draft, path: Path) -> None:
+    """Close loops between links as a YAML file says: `closed_loop`, pairs of links, and `type`, "3d" or "6d" for each.
+
+    **Raises:** `MachineFileError` without PyYAML, and for a file that says it otherwise.
+    """
+    try:
+        import yaml
+    except ImportError as error:
+        raise MachineFileError(f"{path.name} is YAML, which PyYAML reads; pip install 'linkax[files]'") from error
+    try:
+        given = yaml.safe_load(read_file(path))
+    except (yaml.YAMLError, RecursionError) as error:
+        raise MachineFileError(f"{path.name}: no YAML, {' '.join(str(error).split())}; mend the file there") from error
+    pairs = given.get("closed_loop", []) if isinstance(given, Mapping) else None
+    kinds = given.get("type", ["6d"] * len(pairs)) if isinstance(pairs, list) else None
+    if not isinstance(pairs, list) or not isinstance(kinds, list) or len(kinds) != len(pairs):
+        raise MachineFileError(
+            f"{path.name}: give closed_loop: [[link, link], ...] and as many words in type: [3d, ...]"
+        )
+    where = draft.bodies[0].where._replace(path=path, line=1, tag="closed_loop", name="")
+    for index, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
+        if not (isinstance(pair, list) and len(pair) == 2 and all(map(draft.poses.__contains__, map(str, pair)))):
+            raise where.error(f"{pair!r} are not two links of {draft.path.name}")
+        if str(kind).lower() not in OF_YAML:
+            raise where.error(f"type {kind!r} of {pair!r} is not known; known: {', '.join(OF_YAML)}")
+        first, second = (Place.at(str(link), np.eye(4)) for link in pair)
+        draft.joint_at(OF_YAML[str(kind).lower()], f"closed_loop[{index}]", first, second, where, cut=True)
+
+
+def _origin(node: Node | None) -> Pose:
+    if node is None:
+        return np.eye(4)
+    return pose(node.numbers("xyz", 3, ZERO), from_angles(node.numbers("rpy", 3, ZERO)))
+
+
+def _axis(node: Node | None):
+    """The direction in an <axis>, by default x."""
+    direction = np.array([1.0, 0.0, 0.0]) if node is None else node.numbers("xyz", 3, [1.0, 0.0, 0.0])
+    if node is not None and not np.any(direction):
+        raise node.where.error("xyz is 0 0 0; give a direction")
+    return direction

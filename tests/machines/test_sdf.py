@@ -1,0 +1,166 @@
+"""Machines from SDF: Cassie with its closed loops, and what the format says of frames, axes and gears."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import linkax as lx
+
+MACHINES = Path(__file__).parents[1] / "data" / "machines"
+# Loops, degrees of freedom and redundant rows: a floating pelvis has 6, a leg 6 with its springs; the fourth file's
+# pelvis slides. Of the loops of a leg the planar one from crank to foot has a redundant row.
+CASSIE = {"cassie_v2": (4, 18, 2), "cassie_wo_gearbox_spring": (4, 13, 2)}
+
+
+def cassie(name, **settings):
+    with pytest.warns(lx.LeftOutWarning, match=rf"{name}.sdf:\d+: "):
+        return lx.load(MACHINES / f"{name}.sdf", **({"ignore": ["contact", "limit"]} | settings))
+
+
+@pytest.mark.parametrize("name", CASSIE)
+def test_cassie_closes_its_loops(name):
+    mechanism = cassie(name).mechanism()
+    state = lx.assemble(mechanism)
+    loops, freedoms, redundant = CASSIE[name]
+    found = lx.mobility(mechanism, state)
+    assert (mechanism.topology.num_cuts, found.degrees_of_freedom, found.num_redundant) == (loops, freedoms, redundant)
+    violation = lx.Solution.of_state(mechanism, state).worst_violation()
+    assert violation.position < 1e-12
+
+
+@pytest.mark.parametrize("name", ["cassie", "cassie_reduced", "cassie_simple"])
+def test_other_cassies_load(name):
+    machine = cassie(name, ignore=["contact", "limit", "inertia", "joint"])
+    assert machine.mechanism().topology.num_cuts >= 4
+
+
+def test_springs_dampers_and_masses_are_parameters():
+    machine = cassie("cassie_v2")
+    params = machine.params
+    assert params["bodies"]["pelvis"]["mass"] == 10.33
+    assert params["forces"]["left-knee-shin-joint.spring"] == {"stiffness": 1500.0, "free": 0.0}
+    assert params["forces"]["left-tarsus-spring-joint.spring"]["stiffness"] == 1250.0
+    assert np.shape(params["joints"]["left-knee-op"]["parent"]) == (3,)
+
+
+FOUR_BAR = """<sdf version="{version}"><model name="four_bar">
+  <link name="crank"><pose>0 0 0 0 0 0</pose>{inertial}</link>
+  <link name="coupler"><pose>0 0 1 0 0 0</pose>{inertial}</link>
+  <link name="rocker"><pose>2 0 0 0 0 0</pose>{inertial}</link>
+  <joint name="crank_bearing" type="revolute"><parent>world</parent><child>crank</child>{axis}</joint>
+  <joint name="crank_pin" type="revolute"><parent>crank</parent><child>coupler</child>{axis}</joint>
+  <joint name="rocker_pin" type="revolute">
+    <pose>0 0 1 0 0 0</pose><parent>coupler</parent><child>rocker</child>{axis}
+  </joint>
+  <joint name="rocker_bearing" type="revolute"><parent>world</parent><child>rocker</child>{axis}</joint>
+  {more}
+</model></sdf>"""
+INERTIAL = "<inertial><mass>1</mass><inertia><ixx>0.1</ixx><iyy>0.1</iyy><izz>0.1</izz></inertia></inertial>"
+ALONG_Y = "<axis><xyz>0 1 0</xyz></axis>"
+
+
+def extra_link(name, axis, kind="revolute"):
+    """A link on the crank, with its bearing."""
+    joint = f'<joint name="{name}_bearing" type="{kind}"><parent>crank</parent><child>{name}</child>{axis}</joint>'
+    return f'<link name="{name}">{INERTIAL}</link>{joint}'
+
+
+def load(path, text, **settings):
+    path.write_text(text)
+    return lx.load(path, **settings)
+
+
+def four_bar(tmp_path, version="1.7", inertial=INERTIAL, axis=ALONG_Y, more="", **settings):
+    text = FOUR_BAR.format(version=version, inertial=inertial, axis=axis, more=more)
+    return load(tmp_path / "four_bar.sdf", text, **settings)
+
+
+def test_a_link_with_two_parents_closes_a_loop(tmp_path):
+    mechanism = four_bar(tmp_path).mechanism()
+    topology = mechanism.topology
+    assert (topology.num_bodies, topology.num_cuts, topology.num_immobile_rows) == (3, 1, 3)
+
+
+def test_an_axis_is_in_the_frame_that_the_file_says(tmp_path):
+    turned = "<pose>{place} 0 0 1.5707963267948966</pose>"
+    text = FOUR_BAR.format(version="1.7", inertial=INERTIAL, axis="<axis><xyz>0 1 0</xyz></axis>", more="")
+    text = text.replace("<pose>0 0 0 0 0 0</pose>", turned.format(place="0 0 0"), 1)
+    own = load(tmp_path / "own.sdf", text).joints[0]
+    assert own.arguments["axis"].tolist() == [0.0, 1.0, 0.0]
+    assert np.allclose(own.arguments["parent"].rotation @ own.arguments["axis"], [-1.0, 0.0, 0.0])
+    model = load(tmp_path / "model.sdf", text.replace("<xyz>", '<xyz expressed_in="__model__">', 1)).joints[0]
+    assert np.allclose(model.arguments["parent"].rotation @ model.arguments["axis"], [0.0, 1.0, 0.0])
+
+
+def test_poses_are_relative_to_frames(tmp_path):
+    more = """<frame name="top" attached_to="crank"><pose>0 0 1 0 0 0</pose></frame>
+    <link name="tip"><pose relative_to="top" degrees="true">0.5 0 0 0 0 90</pose></link>
+    <joint name="weld" type="fixed"><parent>top</parent><child>tip</child></joint>"""
+    machine = four_bar(tmp_path, more=more)
+    weld = next(joint for joint in machine.joints if joint.name == "weld")
+    assert (weld.arguments["parent"].body, weld.arguments["child"].body) == ("crank", "tip")
+    assert np.allclose(weld.arguments["parent"].offset, [0.5, 0.0, 1.0])
+    assert np.allclose(weld.arguments["parent"].rotation[:, 0], [0.0, 1.0, 0.0])
+
+
+def test_a_mimic_and_a_gearbox_are_couplings(tmp_path):
+    follows = """<axis><xyz>0 1 0</xyz><mimic joint="crank_bearing">
+      <multiplier>2</multiplier><offset>0.3</offset><reference>0.1</reference>
+    </mimic></axis>"""
+    rotor, wheel = extra_link("rotor", follows), extra_link("wheel", ALONG_Y)
+    box = """<joint name="box" type="gearbox"><parent>rotor</parent><child>wheel</child>
+      <gearbox_ratio>0.25</gearbox_ratio><gearbox_reference_body>crank</gearbox_reference_body>
+      <axis><xyz>0 1 0</xyz></axis><axis2><xyz>0 -1 0</xyz></axis2>
+    </joint>"""
+    machine = four_bar(tmp_path, more=rotor + wheel + box)
+    found = {part.name: part.arguments for part in machine.constraints}
+    assert found["rotor_bearing.mimic"]["coefficients"] == {"rotor_bearing": 1.0, "crank_bearing": -2.0}
+    assert found["rotor_bearing.mimic"]["offset"] == pytest.approx(0.1)
+    # θ₁ + ratio θ₂ = 0, with θ₂ about −y
+    assert found["box"]["coefficients"] == {"rotor_bearing": 1.0, "wheel_bearing": -0.25}
+
+
+def test_stops_push_and_friction_holds(tmp_path):
+    limit = "<limit><lower>-0.5</lower><upper>1e16</upper></limit>"
+    axis = f"<axis><xyz>0 1 0</xyz>{limit}<dynamics><friction>0.2</friction></dynamics></axis>"
+    forces = {part.name: part for part in four_bar(tmp_path, axis=axis).forces}
+    stop = forces["crank_bearing.limit"]
+    assert stop.kind is lx.JointLimit
+    assert set(stop.params) == {"lower", "law"}
+    assert forces["crank_bearing.friction"].params["torque"] == 0.2
+
+
+def test_a_screw_advances(tmp_path):
+    link = extra_link("nut", f"{ALONG_Y}<screw_thread_pitch>0.01</screw_thread_pitch>", "screw")
+    thread = next(joint for joint in four_bar(tmp_path, more=link).joints if joint.name == "nut_bearing")
+    assert thread.arguments["pitch"] == pytest.approx(0.01 / (2.0 * np.pi))
+
+
+def test_a_base_that_nothing_holds_is_free_or_fixed(tmp_path):
+    link = f'<link name="body"><pose>0 0 2 0 0 0</pose>{INERTIAL}</link>'
+    text = f'<sdf version="1.7"><model name="one">{link}</model></sdf>'
+    free, fixed = (load(tmp_path / "one.sdf", text, base=base).joints[0] for base in (None, "fixed"))
+    assert (free.kind, fixed.kind) == (lx.Free, lx.Fixed)
+    assert free.arguments["parent"].offset.tolist() == [0.0, 0.0, 2.0]
+
+
+JOINT = '<joint name="{name}" type="{kind}"><parent>{parent}</parent><child>crank</child></joint>'
+IN_A_CIRCLE = """<frame name="a"><pose relative_to="b"/></frame><frame name="b"><pose relative_to="a"/></frame>
+<link name="x"><pose relative_to="a"/></link>"""
+WRONG = (
+    (JOINT.format(name="j", kind="fixed", parent="nobody"), r"four_bar.sdf:11: parent: .*no link"),
+    (JOINT.format(name="crank_pin", kind="fixed", parent="world"), "twice"),
+    (JOINT.format(name="j", kind="belt", parent="world"), "type 'belt'"),
+    (IN_A_CIRCLE, "circle"),
+    ('<link name="x"><pose>0 0 zero 0 0 0</pose></link>', r":11: pose: .*'0 0 zero 0 0 0'; it must be 6 finite"),
+    ("<link/>", "it has no name"),
+    ('<link name="x"><inertial><mass>-1</mass></inertial></link>', r"link 'x'.*mass"),
+    ("<include><uri>model://other</uri></include>", r'ignore=\["include"\]'),
+)
+
+
+@pytest.mark.parametrize(("more", "message"), WRONG)
+def test_what_the_format_does_not_allow_is_named_with_its_line(tmp_path, more, message):
+    with pytest.raises(lx.MachineFileError, match=message):
+        four_bar(tmp_path, more=more)

@@ -1,0 +1,155 @@
+"""Machines from URDF, with the ways in which it closes loops."""
+
+import jax
+import numpy as np
+import pytest
+
+import linkax as lx
+
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial>'
+TREE = """<robot name="four_bar">
+  <link name="frame"/><link name="crank">{inertial}</link><link name="coupler">{inertial}</link>
+  <link name="rocker">{inertial}</link><link name="coupler_end"/><link name="rocker_end"/>
+  <joint name="crank_bearing" type="revolute">
+    <parent link="frame"/><child link="crank"/><axis xyz="0 1 0"/>{more}
+  </joint>
+  <joint name="crank_pin" type="continuous">
+    <parent link="crank"/><child link="coupler"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+  </joint>
+  <joint name="rocker_bearing" type="continuous">
+    <parent link="frame"/><child link="rocker"/><origin xyz="2 0 0" rpy="0 0 0"/><axis xyz="0 1 0"/>
+  </joint>
+  <joint name="end1" type="fixed"><parent link="coupler"/><child link="coupler_end"/><origin xyz="2 0 0"/></joint>
+  <joint name="end2" type="fixed"><parent link="rocker"/><child link="rocker_end"/><origin xyz="0 0 1"/></joint>
+  {closed}
+</robot>"""
+CLOSED = {
+    "loop": """<loop name="rocker_pin" type="revolute"><predecessor link="coupler"><origin xyz="2 0 0"/></predecessor>
+      <successor link="rocker"><origin xyz="0 0 1"/></successor><axis xyz="0 1 0"/></loop>""",
+    "constraint": """<constraint name="rocker_pin" type="revolute"><parent link="coupler"/><parent_origin xyz="2 0 0"/>
+      <parent_axis xyz="0 1 0"/><child link="rocker"/><child_origin xyz="0 0 1"/></constraint>""",
+    "two parents": """<joint name="rocker_pin" type="continuous"><parent link="coupler"/><child link="rocker_end"/>
+      <origin xyz="2 0 0"/><axis xyz="0 1 0"/></joint>""",
+}
+
+
+def load(tmp_path, closed="", more="", **settings):
+    path = tmp_path / "four_bar.urdf"
+    path.write_text(TREE.format(inertial=INERTIAL, closed=closed, more=more))
+    return lx.load(path, **settings)
+
+
+def drawn_apart(machine, name):
+    """How far the two ends of a joint are apart as drawn, from the offsets alone: nothing is turned."""
+    ends = next(joint for joint in machine.joints if joint.name == name).arguments
+    at = {
+        "coupler": [0.0, 0.0, 1.0],
+        "rocker": [2.0, 0.0, 0.0],
+        "coupler_end": [2.0, 0.0, 1.0],
+        "rocker_end": [2.0, 0.0, 1.0],
+    }
+    return np.abs(ends["parent"].offset + at[ends["parent"].body] - ends["child"].offset - at[ends["child"].body]).max()
+
+
+@pytest.mark.parametrize("way", CLOSED)
+def test_every_way_of_closing_a_loop_closes_it(tmp_path, way):
+    machine = load(tmp_path, CLOSED[way])
+    topology = machine.mechanism().topology
+    assert topology.joints[topology.num_bodies :] == ("rocker_pin",)
+    assert topology.num_immobile_rows == 3  # a planar loop
+    assert drawn_apart(machine, "rocker_pin") == 0.0
+
+
+def test_yaml_closes_loops(tmp_path):
+    (tmp_path / "closed.yaml").write_text("closed_loop: [[coupler_end, rocker_end]]\ntype: [3d]\n")
+    machine = load(tmp_path, closures=tmp_path / "closed.yaml")
+    joint = machine.joints[-1]
+    assert (joint.kind, joint.arguments["parent"].body, joint.arguments["cut"]) == (lx.Spherical, "coupler_end", True)
+    (tmp_path / "closed.yaml").write_text("closed_loop: [[coupler_end, nobody]]\n")
+    with pytest.raises(lx.MachineFileError, match=r"closed.yaml:1: .*'nobody'.*four_bar.urdf"):
+        load(tmp_path, closures=tmp_path / "closed.yaml")
+
+
+def test_the_four_bar_moves_as_one_written_by_hand(tmp_path):
+    """The same accelerations, and derivatives in a number of the file."""
+    machine = load(tmp_path, CLOSED["loop"])
+
+    def by_hand(mass):
+        bodies = [
+            lx.RigidBody(name, mass if name == "crank" else 1.0, inertia=(0.1, 0.1, 0.1))
+            for name in ("crank", "coupler", "rocker")
+        ]
+        crank, coupler, rocker = bodies
+        joints = [
+            lx.Revolute("crank_bearing", lx.GROUND, crank, axis="y"),
+            lx.Revolute("crank_pin", crank.at([0.0, 0.0, 1.0]), coupler, axis="y"),
+            lx.Revolute("rocker_bearing", lx.GROUND.at([2.0, 0.0, 0.0]), rocker, axis="y"),
+            lx.Revolute("rocker_pin", coupler.at([2.0, 0.0, 0.0]), rocker.at([0.0, 0.0, 1.0]), axis="y", cut=True),
+        ]
+        return lx.Mechanism(bodies, joints, [lx.Gravity([0.0, 0.0, -9.81])])
+
+    from_file = lambda mass: machine.mechanism({"bodies": {"crank": {"mass": mass}}})
+
+    def turned(model):
+        def after(mass):
+            mechanism = model(mass)
+            state = lx.assemble(mechanism, {"crank_bearing": 0.3}, {"crank_bearing": 1.0})
+            return lx.simulate(mechanism, state, t1=0.2, accuracy=lx.DRAFT).joint("crank_bearing")[-1]
+
+        return jax.value_and_grad(after)(1.3)
+
+    assert np.allclose(turned(from_file), turned(by_hand), rtol=1e-9)
+
+
+def test_a_mimic_and_a_coupling_relate_joints(tmp_path):
+    wheel = """<link name="wheel"/><joint name="wheel_bearing" type="continuous">
+      <parent link="frame"/><child link="wheel"/><axis xyz="0 1 0"/>
+      <mimic joint="crank_bearing" multiplier="-3" offset="0.2"/></joint>
+      <coupling name="gear"><predecessor link="crank"/><successor link="wheel"/><ratio value="-3"/></coupling>"""
+    found = {part.name: part.arguments for part in load(tmp_path, wheel).constraints}
+    assert found["wheel_bearing.mimic"]["coefficients"] == {"wheel_bearing": 1.0, "crank_bearing": 3.0}
+    assert found["wheel_bearing.mimic"]["offset"] == 0.2
+    assert found["gear"]["coefficients"] == {"crank_bearing": 3.0, "wheel_bearing": 1.0}
+
+
+def test_stops_and_dampers(tmp_path):
+    more = '<limit lower="-1" upper="2" effort="9" velocity="1"/><dynamics damping="0.4" friction="0.1"/>'
+    machine = load(tmp_path, more=more)
+    forces = machine.params["forces"]
+    assert forces["crank_bearing.damper"]["damping"] == 0.4
+    assert (forces["crank_bearing.limit"]["lower"], forces["crank_bearing.limit"]["upper"]) == (-1.0, 2.0)
+    with pytest.warns(lx.LeftOutWarning, match=r"four_bar.urdf:5: .*range is ignored as asked"):
+        without = load(tmp_path, more=more, ignore=["limit"])
+    assert "crank_bearing.limit" not in without.params["forces"]
+
+
+WRONG = (
+    ('<joint name="a" type="fixed"><parent link="frame"/><child link="nobody"/></joint>', r":15: child: .*'nobody'"),
+    (
+        '<loop name="a" type="gear"><predecessor link="crank"/><successor link="rocker"/></loop>',
+        "a loop of type 'gear'",
+    ),
+    ('<link name="a"><inertial><mass value="x"/></inertial></link>', r":15: mass: value is 'x'; it must be 1 finite"),
+    ("<drake:ball_constraint/>", r'ignore=\["drake:ball_constraint"\]'),
+    ('<link name="crank"/>', "twice"),
+)
+
+
+@pytest.mark.parametrize(("closed", "message"), WRONG)
+def test_what_the_format_does_not_allow_is_named_with_its_line(tmp_path, closed, message):
+    with pytest.raises(lx.MachineFileError, match=message):
+        load(tmp_path, closed)
+
+
+def test_names_of_parameters_are_checked(tmp_path):
+    machine = load(tmp_path)
+    with pytest.raises(ValueError, match=r"'crnk' \(did you mean 'crank'\?\), which four_bar.urdf has not"):
+        machine.mechanism({"bodies": {"crnk": {"mass": 1.0}}})
+    with pytest.raises(ValueError, match=r"link 'crank': it has no number 'weight'"):
+        machine.mechanism({"bodies": {"crank": {"weight": 1.0}}})
+    with pytest.raises(ValueError, match=r"'no\.\*' fits no parameter"):
+        machine.freeze("no.*")
+    frozen = machine.freeze("bodies.*.inertia", "joints.*")
+    assert "joints" not in frozen.params
+    assert set(frozen.params["bodies"]["crank"]) == {"mass", "center_of_mass"}
+    assert "crank_pin" not in [part.name for part in machine.without("crank_*").joints]
