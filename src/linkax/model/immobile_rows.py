@@ -35,7 +35,7 @@ def is_planar(mechanism: Mechanism) -> bool:
     found = _directions(joints, orientation)
     if found is None:
         return False
-    _, (turns, slides) = found
+    turns, slides = found
     if not turns or any(np.linalg.norm(np.cross(turns[0], turn)) > PARALLEL for turn in turns):
         return False
     return all(abs(slide @ turns[0]) <= PARALLEL for slide in slides)
@@ -96,8 +96,8 @@ def _loop(cut: AbstractJoint, carrier_of: dict[str, tuple[AbstractJoint, str]]) 
 
 def _directions(
     joints: Sequence[AbstractJoint], orientation: Orientations
-) -> tuple[list[np.ndarray], tuple[list[np.ndarray], list[np.ndarray]]] | None:
-    """Find the orientations of joints' parents, and in what directions joints turn and slide; None where traced."""
+) -> tuple[list[np.ndarray], list[np.ndarray]] | None:
+    """Find in what directions joints turn and slide; None where traced."""
     parents = [parent for joint in joints if (parent := orientation[joint.parent.body]) is not None]
     if len(parents) < len(joints) or not all(map(_is_structure, joints)):
         return None
@@ -106,18 +106,19 @@ def _directions(
         axes = parent @ joint.frames()[0]
         turns += [axes @ column for column in np.array(joint.angular_subspace) if np.any(column)]
         slides += [axes @ column for column in np.array(joint.linear_subspace) if np.any(column)]
-    return parents, (turns, slides)
+    return turns, slides
 
 
 def _mobile(cut: AbstractJoint, loop: list[AbstractJoint], orientation: Orientations) -> Tests:
     """Make two tests: whether the loop's motion changes h₁ⁱ·h₂ʲ, and h₁ⁱ·s."""
-    child, found = orientation[cut.child.body], _directions([cut, *loop], orientation)
-    if child is None or found is None:
+    # Rows are functions of the loop's coordinates alone, whatever the cut joint itself can do.
+    parent, child, found = orientation[cut.parent.body], orientation[cut.child.body], _directions(loop, orientation)
+    if parent is None or child is None or found is None or not _is_structure(cut):
         return EVERY_ROW
-    parents, (turns, slides) = found
+    turns, slides = found
     if turns and any(np.linalg.norm(np.cross(turns[0], turn)) > PARALLEL for turn in turns):
         return EVERY_ROW
-    parent_axes, child_axes = parents[0] @ cut.frames()[0], child @ cut.frames()[1]
+    parent_axes, child_axes = parent @ cut.frames()[0], child @ cut.frames()[1]
 
     def fixed(direction: np.ndarray) -> bool:
         return not turns or bool(np.linalg.norm(np.cross(turns[0], direction)) <= PARALLEL)
