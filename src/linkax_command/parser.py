@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
-COMMANDS = ("list", "simulate", "compare", "sweep")
+COMMANDS = ("list", "simulate", "inspect", "compare", "sweep")
 PRESETS = ("draft", "balanced", "precise")
 SOLVERS = ("tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5", "rodas5p", "rk4")
 EQUAL = ("tolerance", "cost")
@@ -23,6 +23,10 @@ STUDY = (
     "STUDY.py defines `function`, of one member's params, and `params`, arrays with one entry for each member, as "
     "linkax.sweep takes them; and perhaps `options`, a dictionary with some of its chunk, memory and difficulty."
 )
+
+
+FILES = "a file of a machine: MJCF, SDF, URDF, USD"
+KINDS = 'a kind of thing in the file to leave out, such as "limit" or "actuator"'
 
 
 class _Parser(argparse.ArgumentParser):
@@ -55,6 +59,13 @@ def parsed(argv: Sequence[str] | None = None) -> argparse.Namespace:
     simulate = commands.add_parser("simulate", help="simulate a scene and write its trajectory and pictures")
     _add_run_options(simulate)
     simulate.add_argument("--formulation", default="tangent-space", metavar="NAME", help="see `linkax compare --help`")
+    inspect = commands.add_parser(
+        "inspect", help="tell what a file of a machine has, how it moves, and what is left out"
+    )
+    inspect.add_argument("scene", metavar="FILE", type=_scene, help=FILES)
+    inspect.add_argument("--variant", metavar="START", help="a start that the file names (default: as drawn)")
+    _add_file_options(inspect)
+    inspect.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
     compare = commands.add_parser(
         "compare",
         help="integrate a scene by all formulations, and compare errors, violations and cost",
@@ -100,10 +111,13 @@ def _scenes() -> dict[str, dict[str, Any]]:
 
 def _add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a run: the scene, its parameters, and how it is integrated."""
-    parser.add_argument("scene", metavar="SCENE", type=_scene, help="a scene of `linkax list`")
-    parser.add_argument("--variant", help="a variant of the scene (default: its first)")
+    parser.add_argument("scene", metavar="SCENE", type=_scene, help=f"a scene of `linkax list`, or {FILES}")
+    parser.add_argument("--variant", help="a variant of the scene (default: its first), or a start of the file")
     parser.add_argument("--t1", type=_positive, metavar="S", help="end time [s]")
     parser.add_argument("--set", dest="changes", action="append", default=[], metavar="NAME=VALUE", help="a parameter")
+    hold = "hold a joint of the file by a motor, at a coordinate [rad or m], by default as drawn"
+    parser.add_argument("--hold", action="append", default=[], metavar="JOINT[=VALUE]", help=hold)
+    _add_file_options(parser)
     parser.add_argument("--preset", default="balanced", type=_one_of(PRESETS), help=f"{', '.join(PRESETS)}")
     parser.add_argument("--rtol", type=_positive, metavar="X", help="tolerance of a step, instead of the preset's")
     solvers = f"{', '.join(SOLVERS)} (default: dopri8, or rodas5p for damped beams)"
@@ -112,6 +126,14 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=_path, metavar="DIR", help="folder for the files (default: under linkax-out)")
     parser.add_argument("--no-plots", action="store_true", help="write no pictures")
     parser.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
+
+
+def _add_file_options(parser: argparse.ArgumentParser) -> None:
+    """Add how a file is read."""
+    parser.add_argument("--ignore", action="append", default=[], metavar="KIND", help=KINDS)
+    parser.add_argument("--base", type=_one_of(("free", "fixed")), metavar="HOW", help="free or fixed, see linkax.load")
+    folders = "a folder below which the file may name others, besides its own"
+    parser.add_argument("--folder", dest="folders", action="append", default=[], metavar="DIR", help=folders)
 
 
 def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +148,7 @@ def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _scene(text: str) -> str:
-    if text not in _scenes():
+    if text not in _scenes() and not (Path(text).suffix and Path(text).is_file()):
         raise argparse.ArgumentTypeError(_unknown(text, _scenes(), "scene "))
     return text
 

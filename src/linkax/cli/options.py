@@ -11,8 +11,9 @@ from typing import Any, SupportsFloat, cast
 import diffrax
 
 import linkax as lx
+from linkax.cli.machine_scene import DRAWN, machine_scene
 from linkax.files import remove_unfinished, writable_folder, written_whole
-from linkax.scenes import Scene, scene
+from linkax.scenes import SCENES, Scene, scene
 from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.rosenbrock import Rodas5P
 from linkax.simulation.integrate.runge_kutta import RungeKutta4
@@ -23,6 +24,7 @@ SOLVERS = {name.lower(): getattr(diffrax, name) for name in OF_DIFFRAX} | {
     "rodas5p": Rodas5P,
     "rk4": RungeKutta4,
 }
+MOST_NAMES = 12  # of parameters in a message
 AtInterrupt = Callable[[Callable[[], str]], None]
 
 
@@ -48,7 +50,7 @@ class RunOptions:
     def __init__(self, arguments: argparse.Namespace) -> None:
         if arguments.solver == "rk4" and arguments.dt is None:
             raise ValueError("--solver rk4 estimates no error; give its steps by --dt")
-        self.scene = scene(arguments.scene)
+        self.scene = asked_scene(arguments)
         self.variant = self.scene.default_variant if arguments.variant is None else arguments.variant
         self.parameters = self.scene.settings(self.variant, _changes(arguments.changes))
         self.t1 = self.scene.duration(self.variant) if arguments.t1 is None else arguments.t1
@@ -69,8 +71,19 @@ class RunOptions:
             "rtol": float(self.accuracy.rtol) if arguments.dt is None else None,
             "step": arguments.dt,
             "solver": next(name for name, kind in SOLVERS.items() if type(self.solver) is kind),
-            "parameters": {name: float(cast(SupportsFloat, entry)) for name, entry in self.parameters.items()},
+            "parameters": {name: float(cast(SupportsFloat, entry)) for name, entry in self._told().items()},
         }
+        if is_file(arguments.scene):
+            self.described |= {
+                "file": arguments.scene,
+                "hold": _changes(arguments.hold, "0"),
+                "ignore": _ignored(arguments),
+            }
+
+    def _told(self):
+        """The parameters of a scene; of a file, which may have hundreds, those that are changed."""
+        known = {} if self.scene.name in SCENES else self.scene.parameters
+        return {name: entry for name, entry in self.parameters.items() if known.get(name) != entry}
 
     def initial(self, mechanism: lx.Mechanism) -> lx.State:
         """Assemble the initial state.
@@ -82,9 +95,44 @@ class RunOptions:
             return self.scene.initial(mechanism, self.parameters)
         except lx.AssemblyError as error:
             what, _, _ = str(error).rpartition("; ")
-            given = ", ".join(f"{name}={self.parameters[name]:g}" for name in self.scene.parameters)
+            given = ", ".join(f"{name}={self.parameters[name]:g}" for name in [*self.scene.parameters][:MOST_NAMES])
             remedy = f"change some of the parameters of scene {self.scene.name!r} by --set NAME=VALUE: {given}"
             raise lx.AssemblyError(f"{what}; {remedy}") from error
+
+
+def is_file(name: str) -> bool:
+    """Whether a command line names a file of a machine, and not a scene."""
+    return name not in SCENES
+
+
+def asked_scene(arguments: argparse.Namespace) -> Scene:
+    """The scene that a command line names, or that of a file of a machine.
+
+    **Raises:** `ValueError` for what belongs to files beside the name of a scene.
+    """
+    if is_file(arguments.scene):
+        hold = {joint: _coordinate(joint, text) for joint, text in _changes(arguments.hold, "0").items()}
+        return machine_scene(loaded(arguments), arguments.variant, hold)
+    for option, given in (("--hold", arguments.hold), ("--ignore", arguments.ignore)):
+        if given:
+            raise ValueError(f"{option} is for files of machines, and {arguments.scene!r} is a scene; leave it out")
+    return scene(arguments.scene)
+
+
+def loaded(arguments: argparse.Namespace) -> lx.Machine:
+    """Read the machine from the file that a command line names."""
+    return lx.load(arguments.scene, ignore=_ignored(arguments), base=arguments.base, folders=arguments.folders)
+
+
+def _ignored(arguments) -> list[str]:
+    return ["contact", *arguments.ignore]
+
+
+def _coordinate(joint, text) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise ValueError(f"--hold {joint}={text!r} is no number; write --hold JOINT=VALUE [rad or m]") from error
 
 
 def output_folder(asked: Path | None, prefix: str, settings: dict[str, Any], files: Iterable[str]) -> Path:
@@ -107,7 +155,8 @@ def output_folder(asked: Path | None, prefix: str, settings: dict[str, Any], fil
 def _free_folder(prefix, settings, files):
     """linkax-out/SCENE, with -VARIANT where that is not the default, and -2, ... where others hold other results."""
     variant = settings["variant"]
-    name = prefix + ("" if variant == scene(settings["scene"]).default_variant else f"-{variant}")
+    is_default = variant in (DRAWN, SCENES[settings["scene"]].default_variant if settings["scene"] in SCENES else None)
+    name = prefix + ("" if is_default else f"-{variant}")
     names = itertools.chain([name], (f"{name}-{count}" for count in itertools.count(2)))
     folders = map(Path("linkax-out").joinpath, names)
     return next(folder for folder in folders if _other_setting(folder, settings, files) is None)
@@ -144,12 +193,14 @@ def at_interrupt_in(at_interrupt: AtInterrupt, folder: Path, keep: Callable[[], 
     at_interrupt(leave)
 
 
-def _changes(assignments) -> dict[str, str]:
-    """{name: value} of NAME=VALUE."""
+def _changes(assignments, default: str | None = None) -> dict[str, str]:
+    """{name: value} of NAME=VALUE; of NAME alone the default, where there is one."""
     changes = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
-        if not equals:
+        if not equals and default is not None:
+            value = default
+        elif not equals:
             raise ValueError(f"--set {assignment!r} has no '='; write --set NAME=VALUE")
         changes[name.strip()] = value.strip()
     return changes

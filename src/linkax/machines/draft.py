@@ -49,6 +49,7 @@ class Draft:
     starts: dict[str, Start] = dataclasses.field(default_factory=dict)
     left_out: list[LeftOut] = dataclasses.field(default_factory=list)
     missing: list[LeftOut] = dataclasses.field(default_factory=list)
+    outside: list[str] = dataclasses.field(default_factory=list)
     _taken: set[tuple[int, str]] = dataclasses.field(default_factory=set)
 
     def leave_out(self, where: Where, kind: str, reason: str, changes_motion: bool = True) -> None:
@@ -163,6 +164,8 @@ class Draft:
             self.leave_out(where, "limit", f"its range from {lower:g} to {upper:g} is empty", False)
             return
         ends = {end: value for end, value in (("lower", lower), ("upper", upper)) if value is not None}
+        if ends.get("lower", 0.0) > 0.0 or ends.get("upper", 0.0) < 0.0:
+            self.outside.append(name)
         law = {"stiffness": stiffness, "exponent": 1.0, "damping": damping}
         self.force(JointLimit, f"{name}.limit", where, joint=joint, law=Part(ContactLaw, law, where), **ends)
 
@@ -239,17 +242,22 @@ class Draft:
         )
 
     def _warn(self):
-        changing = [item for item in self.left_out if item.kind in self.ignore]
-        if not self.left_out:
+        if self.outside:
+            warn(
+                f"{self.path.name}: {', '.join(map(repr, self.outside))} are drawn outside of their ranges, and stops "
+                'push them from there; begin at other positions, or leave stops out by ignore=["contact", "limit"]',
+                LeftOutWarning,
+            )
+        ignored = [item for item in self.left_out if item.kind in self.ignore]
+        if not ignored:
             return
-        shown = (changing or self.left_out)[:SHOWN]
-        more = len(self.left_out) - len(shown)
+        more = len(self.left_out) - len(ignored[:SHOWN])
         rest = f"; {more} more in machine.left_out" if more else ""
-        warn(f"{self.path.name}: left out {'; '.join(map(str, shown))}{rest}", LeftOutWarning)
+        warn(f"{self.path.name}: left out {'; '.join(map(str, ignored[:SHOWN]))}{rest}", LeftOutWarning)
 
 
 class LeftOutWarning(UserWarning):
-    """A file asks for something that the machine does not have; see `linkax.Machine.left_out`."""
+    """What a file asks for, and changes the motion, was left out as asked; see `linkax.Machine.left_out`."""
 
 
 class _Gravity(Part):

@@ -40,8 +40,8 @@ def load(
     elements <loop>, <coupling> and <constraint>, MJCF <equality>, whose two <connect> between the same bodies make a
     hinge. Coordinates are zero where the machine stands as drawn.
 
-    What linkax does not model is in `Machine.left_out`, and a warning (`LeftOutWarning`) names some of it. Where that
-    changes the motion it must be in `ignore`. Stops and dry friction have laws of linkax: where the file does not say
+    What linkax does not model is in `Machine.left_out`. Where that changes the motion it must be in `ignore`, and a
+    warning (`LeftOutWarning`) names some of it. Stops and dry friction have laws of linkax: where the file does not say
     how stiff a stop is, the weight of the machine at its size presses it by 0.001 rad; dry friction is nearly viscous
     below 0.01 rad/s. Both are in `Machine.params`.
 

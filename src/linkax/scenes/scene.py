@@ -8,6 +8,7 @@ import math
 import operator
 import tomllib
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.state import State
 from linkax.xla.tracing import concrete
 
+MOST_NAMES = 30  # of parameters that a message lists
 Parameters = Mapping[str, Any]  # numbers, some of them traced
 _DESCRIBED = tomllib.loads((Path(__file__).parent / "scenes.toml").read_text(encoding="utf-8"))
 
@@ -97,7 +99,11 @@ class Scene:
 
     def _checked(self, name: str, entry: Any) -> Any:
         if name not in self.parameters:
-            raise ValueError(f"scene {self.name!r} has no parameter {name!r}; known: {', '.join(self.parameters)}")
+            known = [*self.parameters]
+            close = get_close_matches(name, known, 1, 0.8) if len(known) > MOST_NAMES else ()
+            meant = f" (did you mean {close[0]!r}?)" if close else ""
+            shown = ", ".join(known[:MOST_NAMES]) + (", ..." if len(known) > MOST_NAMES else "")
+            raise ValueError(f"scene {self.name!r} has no parameter {name!r}{meant}; known: {shown}")
         read = _count if isinstance(self.parameters[name], int) else _finite
         try:
             return read(entry)
