@@ -167,6 +167,7 @@ def floating(seed):
     joints = [numbers.joint(kind, f"joint_{i}", *ends) for i, (kind, *ends) in enumerate(around)]
     joints.append(lx.Free("afloat", lx.GROUND, bodies[0]))
     forces = [lx.JointSpring("joint_3", 2.0), lx.Spring(bodies[0], bodies[2], 3.0), lx.JointDamper(("joint_1", 0), 1.0)]
+    forces += [lx.JointInertia("joint_3", 0.7), lx.JointInertia(("joint_1", 2), 0.4)]
     return lx.Mechanism(bodies, joints, forces)
 
 
@@ -202,6 +203,8 @@ def driven(seed):
         lx.JointSpring(("sleeve", 0), 2.0, 0.1),
         lx.JointTorque(("cardan", 1), 1.3),
         lx.JointFriction("slide", 1.0, 0.2),
+        lx.JointInertia("motor", 0.6),
+        lx.JointInertia("slide", 0.9),
         lx.JointTorque(("table", 0), jax.tree_util.Partial(_restoring, 0.4)),
     ]
     return lx.Mechanism([a, b, c, d], joints, forces, constraints)
@@ -235,6 +238,7 @@ def bending(seed):
         GRAVITY,
         lx.Spring(along(every, 0.0, 0.0), lx.GROUND, 2.0, 0.3),
         lx.JointSpring("slide", 1.5, 0.2),
+        lx.JointInertia("slide", 0.8),
         lx.PointForce(every.at("base"), [1.0, 2.0, 3.0], axes="frame"),
     ]
     around = [lx.GROUND.at(numbers.vector()), every.at("tip"), along(slender, 0.1, 0.0), sleeve]

@@ -272,13 +272,14 @@ def _force(draw, body, joint):
             {**along, "torque": number(), "scale": number()},
             {**of_joint, "torque": "zero or more", "scale": "positive"},
         ),
+        lx.JointInertia: ({**along, "inertia": number()}, {**of_joint, "inertia": "zero or more"}),
     }[kind]
     return Part(kind, (kind.__name__,), arguments, sorts)
 
 
 FORCES = (
     lx.Gravity, lx.Spring, lx.Damper, lx.PointForce, lx.PointMoment, lx.ElasticRope, lx.JointTorque, lx.JointSpring,
-    lx.JointDamper, lx.JointFriction,
+    lx.JointDamper, lx.JointFriction, lx.JointInertia,
 )  # fmt: skip
 
 

@@ -94,6 +94,7 @@ from linkax.model.forces.impacts import Impact as Impact  # noqa: E402
 from linkax.model.forces.internal_states import InternalState as InternalState  # noqa: E402
 from linkax.model.forces.joint_forces import JointDamper as JointDamper  # noqa: E402
 from linkax.model.forces.joint_forces import JointFriction as JointFriction  # noqa: E402
+from linkax.model.forces.joint_forces import JointInertia as JointInertia  # noqa: E402
 from linkax.model.forces.joint_forces import JointSpring as JointSpring  # noqa: E402
 from linkax.model.forces.joint_forces import JointTorque as JointTorque  # noqa: E402
 from linkax.model.forces.joint_limits import JointLimit as JointLimit  # noqa: E402

@@ -54,8 +54,19 @@ def twists(system, t, q, v):
 def kinetic_energy(system, t, q, v):
     velocity, omega = twists(system, t, q, v)
     return (
-        jnp.sum(system.mass[:, None] * velocity**2) + jnp.einsum("bi,bij,bj", omega, inertia(system, t, q), omega)
+        jnp.sum(system.mass[:, None] * velocity**2)
+        + jnp.einsum("bi,bij,bj", omega, inertia(system, t, q), omega)
+        + along_joints(system) @ v**2
     ) / 2
+
+
+def along_joints(system):
+    """Inertia that elements add along speeds."""
+    added = jnp.zeros(system.topology.num_speeds)
+    for force in system.forces:
+        if isinstance(force, lx.JointInertia):
+            added = added.at[system.topology.column(force.joint)].add(force.inertia)
+    return added
 
 
 def inertia(system, t, q):
@@ -118,7 +129,8 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     # Of a joint that bends the reaction has the joint's own forces in it.
     bends = np.array([topology.joint_types[body].motion is not None for body, _ in topology.motions])
     own = np.isin(np.arange(topology.num_speeds), topology.motions[bends, 1])
-    left = left - jnp.where(own, load.joint_force + asked, 0.0)
+    along_own = load.joint_force + asked - along_joints(system) * acceleration
+    left = left - jnp.where(own, along_own, 0.0)
     # On the parent, at its own frame: both sides of a joint balance about the world's origin.
     on_parents = seen_from(configuration, every, "parent", "ground")
     places = [
@@ -142,7 +154,7 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     momenta = jnp.concatenate(along(lambda t, q, v: momentum(system, t, q, v), solved))
     return {
         "velocities": (motion.velocity[:-1] + cross(omega, configuration.center_of_mass()), twists(system, t, q, v)[0]),
-        "mass": (mass, of_masses + of_inertia),
+        "mass": (mass, of_masses + of_inertia + jnp.diag(along_joints(system))),
         "symmetry": (mass, mass.T),
         "force": (force, applied - needed),
         "kinetic energy": (dynamics.kinetic_energy(motion), kinetic_energy(system, t, q, v)),

@@ -61,6 +61,7 @@ CALLS = {
     "JointSpring": (lx.JointSpring, {"joint": "pin", "stiffness": 1.0, "free": 0.0}),
     "JointDamper": (lx.JointDamper, {"joint": "pin", "damping": 1.0}),
     "JointFriction": (lx.JointFriction, {"joint": "pin", "torque": 1.0, "scale": 1.0}),
+    "JointInertia": (lx.JointInertia, {"joint": "pin", "inertia": 1.0}),
     "Mechanism": (lx.Mechanism, {
         "bodies": [LINK], "joints": [PIN], "forces": [], "constraints": [], "all_rows": False,
     }),

@@ -93,6 +93,7 @@ CASES = {
     "JointDamper": (lambda x: lx.JointDamper("pin", x), -1.0, NONE),
     "JointFriction: torque": (lambda x: lx.JointFriction("pin", x, 1.0), 0.0, NOT_NEGATIVE),
     "JointFriction: scale": (lambda x: lx.JointFriction("pin", 1.0, x), 1.0, POSITIVE),
+    "JointInertia": (lambda x: lx.JointInertia("pin", x), 0.0, NOT_NEGATIVE),
     "Rack: module": (lambda x: lx.Rack("rack", *POINTS, 20, x), 1.0, POSITIVE),
     "Gear: offset": (lambda x: lx.Gear("gear", lx.GROUND.at(x), LINK, (20, 30)), *VECTOR),
     "RollingDisc: radius": (lambda x: lx.RollingDisc("disc", LINK, lx.GROUND, x), 1.0, POSITIVE),

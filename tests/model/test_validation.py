@@ -110,6 +110,7 @@ BAD = {
     "spring on one body": (lambda: lx.Spring(body().at([1, 0, 0]), body(), 1.0), ["Spring", "'part'", "two bodies"]),
     "spring of negative length": (lambda: lx.Spring(lx.GROUND, body(), 1.0, -1.0), ["Spring", "'part'", "-1.0"]),
     "friction without a scale": (lambda: lx.JointFriction("pin", 1.0, 0.0), ["'pin'", "scale", "positive"]),
+    "inertia below zero": (lambda: lx.JointInertia("pin", -1.0), ["'pin'", "inertia", "-1.0"]),
     "force in unknown axes": (lambda: lx.PointForce(body(), [1, 0, 0], "body"), ["'part'", "'body'", "'frame'"]),
     "rectangle of no material": (lambda: lx.rectangle(0.1, 0.2, 3.0), ["rectangle", "3.0", "lx.Material"]),
     "circle of no material": (lambda: lx.circle(0.1, "steel"), ["circle", "'steel'", "lx.Material"]),

@@ -6,12 +6,14 @@ about each one's own reference point, so that small bodies far out on a mechanis
 
 from functools import reduce
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, along_speeds
 from linkax.equations.motion import Motion
+from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, expand_to_motions, over_subtree, sum_by_body
 from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs
 from linkax.model.forces.force import Load
@@ -41,9 +43,15 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
 
 def mass_entries(configuration: Configuration) -> StaticSparse:
     """Entries of M that may differ from zero: pairs of speeds that move a common body."""
+    by_bodies = configuration.system.topology.motion_column is not None
+    found = StaticSparse.whole(_mass_by_bodies(configuration)) if by_bodies else _composite_mass(configuration)
+    added = configuration.system.joint_inertia
+    return found if added is None else found.plus_diagonal(added)
+
+
+def _composite_mass(configuration):
+    """M by composite rigid bodies, of speeds that move one body each."""
     system, topology = configuration.system, configuration.system.topology
-    if topology.motion_column is not None:
-        return StaticSparse.whole(_mass_by_bodies(configuration))
     above = lambda carried: _onto_carrier(np.array(topology.predecessor), carried)
     arm = configuration.center_of_mass()
     own_moment = system.mass[:, None] * arm
@@ -114,7 +122,15 @@ def generalised_force(motion: Motion) -> Float[Array, " n_v"]:
 
 def unbalanced_force(motion: Motion, acceleration: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
     """f − M v̇ by recursive Newton-Euler, without forming M [N m, N]."""
-    return _unbalanced(motion, *body_accelerations(motion, acceleration))
+    of_bodies = _unbalanced(motion, *body_accelerations(motion, acceleration))
+    return less_joint_inertia(motion.system, of_bodies, acceleration)
+
+
+def less_joint_inertia(
+    system: System, along: Float[jax.Array, " n_v"], acceleration: Float[Array, " n_v"]
+) -> Float[jax.Array, " n_v"]:
+    """Take from forces along the speeds what the inertia along them needs [N m, N], see `linkax.JointInertia`."""
+    return along if system.joint_inertia is None else along - system.joint_inertia * acceleration
 
 
 def _unbalanced(motion, angular_acceleration, acceleration):
@@ -129,7 +145,9 @@ def kinetic_energy(motion: Motion) -> Float[Array, ""]:
     omega, arm = motion.angular_velocity[:-1], motion.configuration.center_of_mass()
     velocity = motion.velocity[:-1] + cross(omega, arm)
     spin = rotate(world_inertia(motion.configuration), omega)
-    return jnp.sum(motion.system.mass * dot(velocity, velocity) + dot(omega, spin)) / 2.0
+    found = jnp.sum(motion.system.mass * dot(velocity, velocity) + dot(omega, spin)) / 2.0
+    added = motion.system.joint_inertia
+    return found if added is None else found + added @ motion.v**2 / 2.0
 
 
 def potential_energy(configuration: Configuration) -> Scalar:

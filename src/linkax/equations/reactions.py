@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from linkax.equations.configuration import Configuration, bodies_of_cuts
 from linkax.equations.constraint_rows import constraint_load
-from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench
+from linkax.equations.dynamics import applied_load, body_accelerations, inertial_wrench, less_joint_inertia
 from linkax.equations.loop_rows import RowVectors, combined_rows, immobile_rows, plain_rows
 from linkax.equations.loops import sorted_multipliers
 from linkax.equations.motion import Motion
@@ -82,7 +82,8 @@ def reactions(motion: Motion, acceleration: Float[Array, " n_v"], multipliers: F
     """
     load, cut = applied_load(motion), cut_reactions(motion.configuration, multipliers)
     force, moment = inertial_wrench(motion, *body_accelerations(motion, acceleration))
-    needed = Load(jnp.asarray(force) - load.force, jnp.asarray(moment) - load.moment, load.joint_force)
+    along = less_joint_inertia(motion.system, load.joint_force, acceleration)
+    needed = Load(jnp.asarray(force) - load.force, jnp.asarray(moment) - load.moment, along)
     return _carried(motion.configuration, needed, cut, multipliers)
 
 

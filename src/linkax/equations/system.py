@@ -11,7 +11,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from linkax.equations.structure import Structure, structure_of
+from linkax.linalg.static_sparse import constant_product
 from linkax.model.constraints.constraint import AbstractConstraint
+from linkax.model.forces.joint_forces import JointInertia
 from linkax.model.joints.joint import RelativeMotion
 from linkax.model.joints.table_joint import TableJoint
 from linkax.model.mechanism import Mechanism
@@ -33,6 +35,7 @@ class System(KnowsEntries):
       zero on ground, whose part is kept apart in `anchor` [m] (n_j, 3), world axes, so that
       a mechanism far from the origin loses no digits.
     - `parent_axes`, `child_axes` (n_j, 3, 3): the joint's axes as columns, in body axes.
+    - `joint_inertia` [kg m², kg] (n_v,): what `JointInertia` adds along each speed; None where there is none.
     - `joint_parameter` [m] (n_j,): the parameter of a joint whose type has one.
     - `group_parameters`: for each of the topology's `joint_groups` with a `RelativeMotion` the parameters of its
       joints, (n, k); None for the others.
@@ -46,6 +49,7 @@ class System(KnowsEntries):
     mass: Float[Array, " n_b"]
     center_of_mass: Float[Array, "n_b 3"]
     inertia: Float[Array, "n_b 3 3"]
+    joint_inertia: Float[Array, " n_v"] | None
     parent_offset: Float[Array, "n_j 3"]
     child_offset: Float[Array, "n_j 3"]
     anchor: Float[Array, "n_j 3"]
@@ -118,6 +122,7 @@ def _stacked(mechanism, dtype, fixed_scales) -> System:
         mass=stack([body.mass for body in mechanism.bodies], ()),
         center_of_mass=center_of_mass,
         inertia=stack([body.inertia for body in mechanism.bodies], (3, 3)),
+        joint_inertia=_joint_inertia(mechanism, stack),
         parent_offset=jnp.where(parent_on_ground, 0.0, parent_offset),
         child_offset=jnp.where(child_on_ground, 0.0, child_offset),
         anchor=jnp.where(parent_on_ground, parent_offset, jnp.where(child_on_ground, child_offset, 0.0)),
@@ -136,6 +141,15 @@ def _stacked(mechanism, dtype, fixed_scales) -> System:
         constraints=mechanism.constraints,
         forces=mechanism.forces,
     )
+
+
+def _joint_inertia(mechanism, stack):
+    elements = [force for force in mechanism.forces if isinstance(force, JointInertia)]
+    if not elements:
+        return None
+    along = np.array([mechanism.topology.column(element.joint) for element in elements])
+    onto = np.arange(mechanism.topology.num_speeds)[:, None] == along
+    return constant_product(onto, stack([element.inertia for element in elements], ()))
 
 
 def _lengths(topology, parent_offset, child_offset, center_of_mass, bent):

@@ -266,4 +266,6 @@ def _gap(system, t, q):
 def _inertia(system):
     """Of the magnitude of the mechanism's [kg m²]: multipliers over it are of that of accelerations."""
     found = jnp.sum(system.mass) * system.length**2 + largest(system.inertia)
+    if system.joint_inertia is not None:
+        found = found + largest(system.joint_inertia * system.scales**2)
     return lax.stop_gradient(positive_or_one(found))

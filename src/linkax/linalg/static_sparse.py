@@ -53,6 +53,13 @@ class StaticSparse(NamedTuple):
         indices = [part.indices + start * (part.indices > 0) for part, start in zip(parts, first, strict=False)]
         return StaticSparse(jnp.concatenate([part.values for part in parts]), np.concatenate(indices))
 
+    def plus_diagonal(self, added: Float[Array, " n"]) -> "StaticSparse":
+        """Add to the diagonal, each entry of which is among `values`."""
+        place = np.zeros(self.values.shape, dtype=int)
+        place[np.diagonal(self.indices) - 1] = 1 + np.arange(len(added))
+        nothing = jnp.zeros(1, self.values.dtype)
+        return self._replace(values=self.values + jnp.concatenate([nothing, added])[place])
+
     def at(self, down: Int[np.ndarray, "..."] | slice, across: Int[np.ndarray, "..."] | slice) -> Float[Array, "..."]:
         """Read entries, indexed as in NumPy."""
         nothing = jnp.zeros(1, self.values.dtype)

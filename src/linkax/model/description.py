@@ -20,11 +20,11 @@ UNITS = {
 UNITS_ALONG = {
     "rad": {
         "stiffness": "N m/rad", "damping": "N m s/rad", "torque": "N m", "free": "rad", "scale": "rad/s",
-        "speed": "rad/s", "start": "rad",
+        "speed": "rad/s", "start": "rad", "inertia": "kg m²",
     },
     "m": {
         "stiffness": "N/m", "damping": "N s/m", "torque": "N", "free": "m", "scale": "m/s",
-        "speed": "m/s", "start": "m",
+        "speed": "m/s", "start": "m", "inertia": "kg",
     },
 }  # fmt: skip
 FRAMES = ("axis", "second_axis", "coefficients")  # which the tables leave out

@@ -13,6 +13,7 @@ from linkax.model.beams import MASS_PLACES, Beam, BeamElasticity, FrameOnBeam
 from linkax.model.bodies import Frame, RigidBody
 from linkax.model.constraints.constraint import AbstractConstraint
 from linkax.model.forces.force import AbstractForce
+from linkax.model.forces.joint_forces import JointInertia
 from linkax.model.joints.bending import BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.fixed import Fixed
 from linkax.model.joints.joint import AbstractJoint, JointKind
@@ -68,15 +69,22 @@ def discretise_beams(
     )
 
 
-def is_split(joint: AbstractJoint) -> bool:
-    """Tell whether a joint that closes a loop goes into the tree, with a massless body between it and its child."""
-    return isinstance(joint.kind, JointKind) and not isinstance(joint, OnBeam)
+def with_inertia(parts: Parts) -> set[str]:
+    """Name the joints that have inertia along them."""
+    return {name for force in parts.forces if isinstance(force, JointInertia) for name in force.joints}
+
+
+def to_split(parts: Parts, cuts: Iterable[AbstractJoint]) -> list[AbstractJoint]:
+    """Find the cut joints that belong into the tree: those with a motion of their own, and those with inertia."""
+    needs_speed = with_inertia(parts)
+    moves_its_own_way = lambda joint: isinstance(joint.kind, JointKind) and not isinstance(joint, OnBeam)
+    return [joint for joint in cuts if moves_its_own_way(joint) or joint.name in needs_speed]
 
 
 def split_cuts(parts: Parts, cuts: Iterable[AbstractJoint]) -> Parts:
-    """Put the joints with a motion of their own that are cut into the tree: a weld closes each loop in their place."""
+    """Put cut joints into the tree, with a massless body behind each: a weld closes each loop in their place."""
     bodies, joints = [*parts.bodies], {joint.name: [joint] for joint in parts.joints}
-    for joint in filter(is_split, cuts):
+    for joint in cuts:
         end = RigidBody(f"{joint.name} (end)", 0.0)
         carrier = copy.copy(joint)
         for name, entry in (("child", end.reference), ("cut", False)):

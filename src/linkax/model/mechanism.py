@@ -11,7 +11,7 @@ from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
 from linkax.model.constraints.constraint import AbstractConstraint, LinearConstraint
 from linkax.model.description import described
-from linkax.model.discretisation import Parts, discretise_beams, is_split, split_cuts, tree_joints_first
+from linkax.model.discretisation import Parts, discretise_beams, split_cuts, to_split, tree_joints_first, with_inertia
 from linkax.model.elements import is_own
 from linkax.model.forces.force import AbstractForce, given_name
 from linkax.model.forces.internal_states import checked_states
@@ -31,9 +31,9 @@ class Mechanism(eqx.Module):
     """Bodies connected by joints, with the constraints and forces on them.
 
     The spanning tree and the cut joints are found here, whatever the order of the joints: joints first that a
-    constraint relates or a force acts along, then breadth first from ground. `print(mechanism)` shows all in tables,
-    `print(mechanism.topology.describe())` the tree; `cut=True` cuts a joint. Bodies and joints are kept in the order of
-    the tree.
+    constraint relates, that have inertia or that a force acts along, then breadth first from ground.
+    `print(mechanism)` shows all in tables, `print(mechanism.topology.describe())` the tree; `cut=True` cuts a joint.
+    Bodies and joints are kept in the order of the tree.
 
     A beam becomes sections, bodies with names such as "boom[2.5]" (counted in elements from the base), and a
     massless body at each place that something attaches to. `beams` holds the beams as given.
@@ -71,8 +71,8 @@ class Mechanism(eqx.Module):
         parts = discretise_beams(*given)
         body_by_name = _check_names(parts)
         tree = _spanning_tree(list(body_by_name), parts)
-        if any(is_split(joint) for joint in tree.cuts):
-            parts = split_cuts(parts, tree.cuts)
+        while misplaced := to_split(parts, tree.cuts):
+            parts = split_cuts(parts, misplaced)
             body_by_name = _check_names(parts)
             tree = _spanning_tree(list(body_by_name), parts)
         self.bodies = read_only(tuple(body_by_name[name] for name in tree.bodies))
@@ -175,7 +175,8 @@ def _spanning_tree(bodies: list[str], parts: Parts) -> SpanningTree:
     """Find the tree, with joints in it that a constraint relates, and where possible those that a force acts along."""
     related = {name for constraint in parts.constraints for name in constraint.joints}
     acted_on = {name for force in parts.forces for name in force.joints}
-    tree = spanning_tree(bodies, parts.joints, [*tree_joints_first(parts.joints), related, acted_on])
+    first = [*tree_joints_first(parts.joints), related, with_inertia(parts), acted_on]
+    tree = spanning_tree(bodies, parts.joints, first)
     for joint in tree.cuts:
         if isinstance(joint, OnBeam):
             raise ValueError(

@@ -29,7 +29,7 @@ class DCMotor(AlongJoint):
     - `joint`: a name, or (name, index).
     - `voltage`: u [V], a number, or a function (t, motion) ↦ number; see `linkax.JointTorque`.
     - `resistance`: R [Ω]. `inductance`: L [H]. `constant`: k [N m/A, or N/A on a slide], the torque of one ampere and
-      the voltage of one rad/s; of a motor with a gear, times the gear's ratio.
+      the voltage of one rad/s; of a motor with a gear, times the gear's ratio. Its rotor is a `linkax.JointInertia`.
     - `current`: at the start [A]. `scale`: a typical current [A], see `linkax.InternalState`.
     - `name`: see `linkax.AbstractForce`.
 

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -133,3 +133,40 @@ class JointFriction(AlongJoint):
 
     def strength(self, t: Number, motion: Motion) -> Scalar:
         return -self.torque * jnp.tanh(motion.joint_rate(self.joint) / self.scale)
+
+
+class JointInertia(AlongJoint):
+    """Inertia of a geared rotor along a joint: it adds inertia × speed² / 2 to the kinetic energy, and no more.
+
+    A rotor with moment of inertia J that turns n times as fast as its joint has the inertia n² J. Its gyroscopic
+    moments, in proportion to n J, are left out, and its mass belongs to the body that carries it. MuJoCo calls this
+    armature, Drake reflected inertia. The force −inertia × acceleration acts on the child along the joint, its opposite
+    on the parent; the joint's reaction is what remains, as with other forces along joints.
+
+    Along a turn of a ball or of a free joint it is exact only where all three turns have the same inertia. Where its
+    joint closes a loop, a massless body is put between the joint and its child, so that the speed counts as others do.
+
+    **Arguments:** `joint`: a name, or (name, index); `inertia` [kg m² or kg]; `name`, see `linkax.AbstractForce`.
+
+    **Raises:** `ValueError` for a negative inertia.
+    """
+
+    inertia: Scalar
+
+    def __init__(self, joint: TermLike, inertia: Number, *, name: str | None = None) -> None:
+        self.name = optional_name(name, "JointInertia")
+        self.joint = term(joint, "JointInertia")
+        self.inertia = zero_or_more(inertia, f"{self.display_name}: inertia [kg m² or kg]")
+
+    @property
+    def conserves_energy(self) -> bool:
+        return True
+
+    def strength(self, t: Number, motion: Motion) -> NoReturn:
+        raise ValueError(
+            f"{self.display_name} has a force that follows from accelerations; read -inertia * "
+            f"solution.joint_acceleration({self.joint.joint!r})"
+        )
+
+    def load(self, t: Number, motion: Motion) -> Load:
+        return Load.none(motion.system)

@@ -1,5 +1,7 @@
 """Why a run failed: the elements to blame, looked for after the run."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -192,7 +194,10 @@ def massless_bodies(system: System, method: TangentSpace, t: Scalar, q: Float[Ar
     """Names of bodies that can move without moving any mass; magnitudes do not matter, so all masses are set to one."""
     moment = jnp.max(jnp.abs(system.inertia), axis=(1, 2))
     inertia = ratio(system.inertia, moment[:, None, None], 0.0) * system.length**2
-    equal = eqx.tree_at(lambda s: (s.mass, s.inertia), system, (ratio(system.mass, system.mass, 0.0), inertia))
+    along = system.joint_inertia
+    if along is not None:
+        along = ratio(along, along, 0.0) * (system.length / system.scales) ** 2
+    equal = dataclasses.replace(system, mass=ratio(system.mass, system.mass, 0.0), inertia=inertia, joint_inertia=along)
     configuration = configure(equal, t, q)
     basis = invert(None, jacobian(configuration), system.scales, method.tolerance).basis
     basis = np.asarray(basis)[:, np.any(np.asarray(basis) != 0.0, axis=0)]
