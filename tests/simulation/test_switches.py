@@ -163,6 +163,20 @@ def test_starts_at_a_switch_and_taut(falls):
     assert found.stats["num_steps"] < 40
 
 
+@pytest.mark.parametrize("late", [0.0, 1e3, 1e6])
+def test_switches_at_late_times(late):
+    """Two periods in closed form, also where numbers of time are too far apart to meet a switch to its own rounding."""
+    weight, soft, stiff = lx.point_mass("weight", 2.0), 1e3, 4e3
+    forces = [lx.JointSpring("slide", soft), lx.ElasticRope([lx.GROUND.at([-1.0, 0.0, 0.0]), weight], stiff, 1.0)]
+    mechanism = lx.Mechanism([weight], [lx.Prismatic("slide", lx.GROUND, weight, "x")], forces)
+    period = np.pi * (np.sqrt(2.0 / soft) + np.sqrt(2.0 / (soft + stiff)))
+    start = lx.State(jnp.array([0.5]), jnp.zeros(1))
+    found = lx.simulate(mechanism, start, t0=late, t1=late + 2.0 * period, saveat=SAVE_END)
+    rounding = 50.0 * np.finfo(float).eps * late  # times a speed of 25 m/s
+    np.testing.assert_allclose(found.q, [[0.5]], atol=1e-6 + rounding)
+    assert found.stats["num_steps"] < 200
+
+
 @pytest.mark.parametrize("switch", [lambda: jnp.zeros(2), lambda: 1 / 0])
 def test_switches_that_are_no_number(switch):
     class Bad(Friction):

@@ -121,7 +121,9 @@ def meet(
     after = kept.at[:num].set(jnp.where(arrives, -sides, sides))
     if len(stops):
         after = after.at[stops].set(sides[stops]).at[num : num + len(stops)].add(arrives[stops])
-    return jnp.where(resolved, jnp.maximum(share, SHORTEN), 1.0), after
+    # A step that would end where it begins would be followed by none but such.
+    shortest = jnp.maximum(SHORTEN, least / (2.0 * duration))
+    return jnp.where(resolved, jnp.maximum(share, shortest), 1.0), after
 
 
 def crossed(
