@@ -67,6 +67,7 @@ from linkax.model.constraints.gears import Gear as Gear  # noqa: E402
 from linkax.model.constraints.gears import Rack as Rack  # noqa: E402
 from linkax.model.constraints.guides import PointOnSurface as PointOnSurface  # noqa: E402
 from linkax.model.constraints.guides import Prescribed as Prescribed  # noqa: E402
+from linkax.model.constraints.polynomial_coupling import PolynomialCoupling as PolynomialCoupling  # noqa: E402
 from linkax.model.constraints.rolling import RollingDisc as RollingDisc  # noqa: E402
 from linkax.model.constraints.rolling import RollingSphere as RollingSphere  # noqa: E402
 from linkax.model.constraints.rolling import Skate as Skate  # noqa: E402

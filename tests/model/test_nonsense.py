@@ -48,6 +48,9 @@ CALLS = {
     "Sliding": (lx.Sliding, {"name": "sleeve", "beam": BOOM, "child": LINK}),
     "Rope": (lx.Rope, {"name": "hoist", "points": [lx.GROUND, LINK], "length": 1.0}),
     "Coupling": (lx.Coupling, {"name": "gears", "coefficients": {"pin": 1.0}, "offset": 0.0}),
+    "PolynomialCoupling": (lx.PolynomialCoupling, {
+        "name": "curve", "joint": "pin", "of": {"knee": 1.0}, "coefficients": [0.0, 1.0, 2.0],
+    }),
     "Drive": (lx.Drive, {"name": "motor", "joint": "pin", "motion": jnp.sin}),
     "Gravity": (lx.Gravity, {"acceleration": [0, 0, 1]}),
     "Spring": (lx.Spring, {**PAIR, "stiffness": 1.0, "free_length": 1.0}),

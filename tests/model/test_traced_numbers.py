@@ -81,6 +81,10 @@ CASES = {
     "ElasticRope: damping": (lambda x: lx.ElasticRope(POINTS, 1.0, 1.0, x), 0.0, NOT_NEGATIVE),
     "Coupling: coefficients": (lambda x: lx.Coupling("gears", {"pin": x, "knee": 0.0}), 1.0, [*NONE, 0.0]),
     "Coupling: offset": (lambda x: lx.Coupling("gears", {"pin": 1.0}, x), -1.0, NONE),
+    "PolynomialCoupling: coefficients": (lambda x: lx.PolynomialCoupling("curve", "pin", "knee", x), *VECTOR),
+    "PolynomialCoupling: factor": (
+        lambda x: lx.PolynomialCoupling("curve", {"pin": x}, "knee", [0.0, 1.0, 2.0]), -1.0, [*NONE, 0.0],
+    ),
     "Gravity": (lx.Gravity, *VECTOR),
     "Spring: stiffness": (lambda x: lx.Spring(*POINTS, x), -1.0, NONE),
     "Spring: free length": (lambda x: lx.Spring(*POINTS, 1.0, x), 0.0, NOT_NEGATIVE),

@@ -100,6 +100,14 @@ BAD = {
     "coupling of nothing": (lambda: lx.Coupling("gears", {}), ["'gears'", "{}", "factor"]),
     "coupling by zero": (lambda: lx.Coupling("gears", {"pin": 0.0}), ["'gears'", "0.0", "not zero"]),
     "coupling of a number": (lambda: lx.Coupling("gears", {3: 1.0}), ["'gears'", "3", "name of a joint"]),
+    "curve of one number": (
+        lambda: lx.PolynomialCoupling("curve", "pin", "knee", [1.0]),
+        ["'curve'", "(1,)", "two or more"],
+    ),
+    "curve of nothing": (
+        lambda: lx.PolynomialCoupling("curve", "pin", {}, [0.0, 1.0]),
+        ["'curve'", "of is {}", "give"],
+    ),
     "drive by a number": (lambda: lx.Drive("motor", "pin", 2.0), ["'motor'", "2.0", "function of time", "speed="]),
     "drive without motion": (lambda: lx.Drive("motor", "pin"), ["'motor'", "no motion", "speed="]),
     "drive by two laws": (lambda: lx.Drive("motor", "pin", jnp.sin, speed=2.0), ["'motor'", "speed is 2.0", "one of"]),
@@ -215,6 +223,14 @@ RELATED = {
     "drive of a ball": (lx.Drive("motor", "ball", jnp.sin), ["'motor'", "'ball'", "3 speeds"]),
     "drive of a ball at constant speed": (lx.Drive("motor", "ball", speed=1.0), ["'motor'", "'ball'", "3 speeds"]),
     "drive of a turning ball": (lx.Drive("motor", ("ball", 1), jnp.sin), ["'motor'", "'ball'", "quaternion"]),
+    "curve of a turning ball": (
+        lx.PolynomialCoupling("curve", "pin", {("ball", 1): 2.0}, [0.0, 1.0, 2.0]),
+        ["'curve'", "'ball'", "quaternion", "another"],
+    ),
+    "curve of a cut joint": (
+        lx.PolynomialCoupling("curve", "far", "pin", [0.0, 1.0, 2.0]),
+        ["'curve'", "'far'", "cut"],
+    ),
     "name taken by a joint": (lx.Distance("pin", lx.GROUND, LINK, 1.0), ["'pin'", "2 times", "of its own"]),
     "no constraint": (lx.Gravity([0, 0, 1]), ["constraints", "Gravity", "forces=[...]"]),
 }

@@ -27,7 +27,7 @@ UNITS_ALONG = {
         "speed": "m/s", "start": "m", "inertia": "kg",
     },
 }  # fmt: skip
-FRAMES = ("axis", "second_axis", "coefficients")  # which the tables leave out
+FRAMES = ("axis", "second_axis")  # which the tables leave out
 
 
 def described(mechanism: Mechanism) -> Table:

@@ -9,7 +9,7 @@ import equinox as eqx
 
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
-from linkax.model.constraints.constraint import AbstractConstraint, LinearConstraint
+from linkax.model.constraints.constraint import AbstractConstraint, CoordinateConstraint
 from linkax.model.description import described
 from linkax.model.discretisation import Parts, discretise_beams, split_cuts, to_split, tree_joints_first, with_inertia
 from linkax.model.elements import is_own
@@ -247,7 +247,7 @@ def _check_references(
         check_frames(constraint.display_name, constraint.frames)
         for name, index in constraint.terms:
             check_joint(constraint.display_name, name)
-            if isinstance(constraint, LinearConstraint):
+            if isinstance(constraint, CoordinateConstraint):
                 _check_index(constraint.display_name, joints[name], index, True)
         if is_own(constraint):
             constraint.check_residual({name: joints[name].num_coordinates for name in constraint.joints})

@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from linkax.model.attached import Attached, BodyPose, Moving
@@ -16,8 +15,8 @@ from linkax.model.bodies import Frame
 from linkax.model.elements import AbstractElement, Time
 from linkax.model.functions import MISTAKES, Law, of_element
 from linkax.model.names import ByName
-from linkax.model.numbers import Number, number, require
-from linkax.model.terms import Term, TermLike, term
+from linkax.model.numbers import Number, number
+from linkax.model.terms import Combination, Term, TermLike, term
 from linkax.xla.arrays import Array, Scalar
 
 # What a row of each unit is one of: 1, or a power of the mechanism's length.
@@ -192,38 +191,34 @@ class HeldConstraint(AbstractConstraint):
         return self.t + jnp.where(self.unless, t - self.t, 0.0)
 
 
-class LinearConstraint(AbstractConstraint):
-    """A linear relation between coordinates of joints in the tree: Σ coefficient × coordinate = right side.
-
-    - `related`: the terms of these coordinates.
-    """
+class CoordinateConstraint(AbstractConstraint):
+    """A relation between coordinates of joints in the tree, those of its `terms`."""
 
     units = ("",)
 
-    related: tuple[Term, ...] = eqx.field(static=True)
-    coefficients: Float[Array, " n"]
-
     @property
     def joints(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(along.joint for along in self.related))
+        return tuple(dict.fromkeys(along.joint for along in self.terms))
+
+
+class LinearConstraint(CoordinateConstraint):
+    """A linear relation between coordinates of joints in the tree: their combination = right side."""
+
+    combination: Combination
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        return self.related
+        return self.combination.terms
 
     @abc.abstractmethod
     def right_side(self, t: Number) -> Scalar:
         """Compute the right side at time t [s]."""
 
     def residual(self, t: Number, attached: Attached) -> Scalar:
-        found = -jnp.asarray(self.right_side(t))
-        for along, coefficient in zip(self.related, self.coefficients, strict=True):
-            found = found + coefficient * attached.coordinate(along)
-        return found
+        return self.combination.of(attached.coordinate) - self.right_side(t)
 
     def row_scales(self, length: Scalar, slides: Callable[[Term], bool]) -> list[Scalar]:
-        units = [length if slides(along) else 1.0 for along in self.related]
-        return [jnp.max(jnp.abs(jnp.stack([c * unit for c, unit in zip(self.coefficients, units, strict=True)])))]
+        return [self.combination.largest(lambda along: length if slides(along) else 1.0)]
 
 
 class Coupling(LinearConstraint):
@@ -252,13 +247,9 @@ class Coupling(LinearConstraint):
         offset: Number = 0.0,
     ) -> None:
         self.name = checked_name(name, "coupling")
-        if not isinstance(coefficients, Mapping) or not coefficients:
+        if not isinstance(coefficients, Mapping):
             raise ValueError(f"coupling {name!r}: coefficients are {coefficients!r}; give {{joint: factor, ...}}")
-        self.related = tuple(term(key, f"coupling {name!r}") for key in coefficients)
-        what = f"coupling {name!r}: coefficients"
-        factors = number(list(coefficients.values()), (len(coefficients),), what)
-        remedy = "all are zero; give a factor that is not zero"
-        self.coefficients = require(factors, lambda x: (x != 0.0).any(), what, remedy)
+        self.combination = Combination(coefficients, f"coupling {name!r}: coefficients")
         self.offset = number(offset, (), f"coupling {name!r}: offset")
 
     def right_side(self, t: Number) -> Scalar:
@@ -302,8 +293,7 @@ class Drive(LinearConstraint):
     ) -> None:
         self.name = checked_name(name, "drive")
         what = f"drive {name!r}"
-        self.related = (term(joint, what),)
-        self.coefficients = np.ones(1)
+        self.combination = Combination({term(joint, what): 1.0}, what)
         self.motion = self.speed = self.start = None
         if motion is None and speed is None:
             raise ValueError(f"{what} has no motion; give a function of time, lambda t: ..., or speed=")
