@@ -78,6 +78,7 @@ from linkax.model.curves import PeriodicSpline as PeriodicSpline  # noqa: E402
 from linkax.model.curves import SplineCurve as SplineCurve  # noqa: E402
 from linkax.model.forces.actuators import DCMotor as DCMotor  # noqa: E402
 from linkax.model.forces.actuators import PneumaticSpring as PneumaticSpring  # noqa: E402
+from linkax.model.forces.affine_actuator import AffineActuator as AffineActuator  # noqa: E402
 from linkax.model.forces.contact import Clearance as Clearance  # noqa: E402
 from linkax.model.forces.contact import Contact as Contact  # noqa: E402
 from linkax.model.forces.contact_law import ContactLaw as ContactLaw  # noqa: E402

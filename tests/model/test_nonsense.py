@@ -65,6 +65,9 @@ CALLS = {
     "JointDamper": (lx.JointDamper, {"joint": "pin", "damping": 1.0}),
     "JointFriction": (lx.JointFriction, {"joint": "pin", "torque": 1.0, "scale": 1.0}),
     "JointInertia": (lx.JointInertia, {"joint": "pin", "inertia": 1.0}),
+    "AffineActuator": (lx.AffineActuator, {
+        "transmission": {"pin": 1.0}, "control": 1.0, "gain": 1.0, "bias": [0, -1, 0], "force_range": [-1, 1],
+    }),
     "Mechanism": (lx.Mechanism, {
         "bodies": [LINK], "joints": [PIN], "forces": [], "constraints": [], "all_rows": False,
     }),

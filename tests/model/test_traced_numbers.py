@@ -107,6 +107,13 @@ CASES = {
     "Prescribed: offset": (lambda x: lx.Prescribed("lift", LINK.at(x), lambda t: t * jnp.ones(3)), *VECTOR),
     "Cam: roller": (lambda x: lx.Cam("cam", lx.GROUND, LINK, jnp.cos, x), 0.0, NOT_NEGATIVE),
     "CurveJoint: up": (lambda x: lx.CurveJoint("wire", lx.GROUND, LINK, lambda u: u * jnp.ones(3), up=x), *VECTOR),
+    "AffineActuator: factor": (lambda x: lx.AffineActuator({"pin": x}), -1.0, [*NONE, 0.0]),
+    "AffineActuator: bias": (lambda x: lx.AffineActuator("pin", bias=x), *VECTOR),
+    "AffineActuator: gain": (lambda x: lx.AffineActuator("pin", gain=x), *VECTOR),
+    "AffineActuator: force range": (
+        lambda x: lx.AffineActuator("pin", force_range=x), np.array([-1.0, 1.0]),
+        [[1.0, -1.0], [0.0, 0.0], [np.nan, 1.0], [0.0, np.inf]],
+    ),
     "DCMotor: inductance": (
         lambda x: lx.DCMotor("pin", 1.0, resistance=1.0, inductance=x, constant=1.0), 1.0, POSITIVE,
     ),

@@ -119,6 +119,13 @@ BAD = {
     "spring of negative length": (lambda: lx.Spring(lx.GROUND, body(), 1.0, -1.0), ["Spring", "'part'", "-1.0"]),
     "friction without a scale": (lambda: lx.JointFriction("pin", 1.0, 0.0), ["'pin'", "scale", "positive"]),
     "inertia below zero": (lambda: lx.JointInertia("pin", -1.0), ["'pin'", "inertia", "-1.0"]),
+    "actuator of nothing": (lambda: lx.AffineActuator({}), ["AffineActuator", "transmission is {}", "give"]),
+    "actuator by zero": (lambda: lx.AffineActuator({"pin": 0.0}), ["transmission", "[0.0]", "not zero"]),
+    "actuator with two gains": (lambda: lx.AffineActuator("pin", gain=[1.0, 2.0]), ["'pin'", "gain", "(2,)", "(3,)"]),
+    "actuator between wrong limits": (
+        lambda: lx.AffineActuator("pin", force_range=[1.0, -1.0], name="servo"),
+        ["'servo'", "force_range", "[1.0, -1.0]", "above"],
+    ),
     "force in unknown axes": (lambda: lx.PointForce(body(), [1, 0, 0], "body"), ["'part'", "'body'", "'frame'"]),
     "rectangle of no material": (lambda: lx.rectangle(0.1, 0.2, 3.0), ["rectangle", "3.0", "lx.Material"]),
     "circle of no material": (lambda: lx.circle(0.1, "steel"), ["circle", "'steel'", "lx.Material"]),
@@ -182,6 +189,12 @@ SPREAD = {
         [lx.Spherical("ball", lx.GROUND, LINK)],
         [lx.JointSpring(("ball", 0), 1.0)],
         ["'ball'", "JointSpring", "quaternion", "another"],
+    ),
+    "actuator along a quaternion": (
+        [LINK],
+        [lx.Spherical("ball", lx.GROUND, LINK)],
+        [lx.AffineActuator({("ball", 2): 0.5})],
+        ["'ball'", "AffineActuator", "quaternion", "another"],
     ),
     "spring to a body that is not there": ([LINK], [PIN], [lx.Spring(LINK, OTHER, 1.0)], ["Spring", "'other'", "add"]),
 }

@@ -113,6 +113,11 @@ class AbstractForce(AbstractElement):
         """
         return None
 
+    @property
+    def has_switch(self) -> bool:
+        """Whether its load has a kink or jumps; by default whether its class defines `switch`."""
+        return type(self).switch is not AbstractForce.switch
+
     def switched(self, t: Time, motion: Motion) -> Float[jax.Array, ""]:
         """Compute the switch and check it.
 
@@ -130,7 +135,7 @@ class AbstractForce(AbstractElement):
 
     def side(self, t: Time, motion: Motion) -> tuple[Any, ...]:
         """Compute what `load` takes besides t and motion: whether the switch is positive, where there is one."""
-        return (self.switched(t, motion) > 0.0,) if has_switch(self) else ()
+        return (self.switched(t, motion) > 0.0,) if self.has_switch else ()
 
     def applied(self, t: Time, motion: Motion, on: Any = None) -> Load:
         """Compute the load and check it; `on`: see `load`, by default whether the switch is positive now.
@@ -162,7 +167,7 @@ class AbstractForce(AbstractElement):
         return jnp.zeros(0, motion.system.dtype)
 
     def _held_side(self, t, motion, on):
-        return self.side(t, motion) if on is None or not has_switch(self) else (on,)
+        return self.side(t, motion) if on is None or not self.has_switch else (on,)
 
     def _ended(self, what, error, function, arguments):
         """What to raise where the load, the switch or the rates have raised an error."""
@@ -196,6 +201,10 @@ class Bound(AbstractForce):
     def conserves_energy(self) -> bool:
         return self.element.conserves_energy
 
+    @property
+    def has_switch(self) -> bool:
+        return self.element.has_switch
+
     def extent(self, configuration: Configuration) -> Any:
         return self.element.extent(configuration)
 
@@ -222,11 +231,6 @@ class Bound(AbstractForce):
     def _ended(self, what, error, function, arguments):
         t, motion, *side = arguments
         return super()._ended(what, error, getattr(self.element, what), (t, motion, self.named, *side))
-
-
-def has_switch(force: AbstractForce) -> bool:
-    """Tell whether the load of a force element has a kink or jumps, see `AbstractForce.switch`."""
-    return type(force.itself).switch is not AbstractForce.switch
 
 
 def given_name(force: AbstractForce) -> str | None:

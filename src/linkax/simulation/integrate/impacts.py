@@ -17,7 +17,6 @@ from linkax.equations.coordinates import rates
 from linkax.equations.system import System
 from linkax.formulations.formulation import linear_system
 from linkax.formulations.tangent_space import TangentSpace
-from linkax.model.forces.force import has_switch
 from linkax.model.forces.impacts import Impact
 from linkax.model.mechanism import Mechanism
 from linkax.xla.arrays import Array
@@ -33,7 +32,7 @@ def impacts_of(mechanism: Mechanism | System) -> list[Impact]:
 
 def places(mechanism: Mechanism | System) -> Int[np.ndarray, " k"]:
     """The indices of impacts among the switches."""
-    switches = [force for force in mechanism.forces if has_switch(force)]
+    switches = [force for force in mechanism.forces if force.has_switch]
     return np.array([index for index, force in enumerate(switches) if isinstance(force, Impact)], dtype=int)
 
 
@@ -44,7 +43,7 @@ def record(mechanism: Mechanism | System, kept: Float[Array, "*batch n"]) -> Flo
 
 
 def _record_begins(mechanism):
-    return sum(map(has_switch, mechanism.forces))
+    return sum(force.has_switch for force in mechanism.forces)
 
 
 def at_rest(system: System, kept: Float[Array, " kept"]) -> Bool[Array, ""]:

@@ -20,7 +20,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.motion import Motion, move
 from linkax.equations.system import System
 from linkax.model.elements import Time
-from linkax.model.forces.force import AbstractForce, Load, has_switch
+from linkax.model.forces.force import AbstractForce, Load
 from linkax.simulation.integrate import impacts
 from linkax.xla.arrays import Array
 
@@ -53,19 +53,19 @@ class Held(eqx.Module):
 def held(system: System, sides: Sides) -> System:
     """Hold the force elements of a system on the given sides of their switches."""
     each = iter(sides)
-    forces = tuple(Held(force, next(each)) if has_switch(force) else force for force in system.forces)
+    forces = tuple(Held(force, next(each)) if force.has_switch else force for force in system.forces)
     return dataclasses.replace(system, forces=forces, known=None)
 
 
 def values(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Float[Array, " m"]:
     """Values of all switches of force elements, (m,)."""
     motion = move(configure(system, t, q), v)
-    return jnp.stack([force.switched(t, motion) for force in system.forces if has_switch(force)])
+    return jnp.stack([force.switched(t, motion) for force in system.forces if force.has_switch])
 
 
 def start_sides(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Sides:
     """The sides of switches at a state where a run begins, without impacts so far; () without switches."""
-    if not any(map(has_switch, system.forces)):
+    if not any(force.has_switch for force in system.forces):
         return ()
     found, stops = values(system, t, q, v), impacts.places(system)
     least = np.zeros(len(found))
@@ -90,7 +90,7 @@ def meet(
     with impacts counted, and not yet happened.
     """
     kept, on = problem.sides(y0), ON_ULPS * jnp.finfo(y0.dtype).eps
-    stops, num = impacts.places(problem.system), sum(map(has_switch, problem.system.forces))
+    stops, num = impacts.places(problem.system), sum(force.has_switch for force in problem.system.forces)
     sides = kept[:num]
     duration = t1 - t0
     inside = lambda share: sides * problem.switches(t0 + share * duration, within(t0 + share * duration))
