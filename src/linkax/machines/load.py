@@ -7,6 +7,7 @@ from typing import Literal
 
 from linkax.machines.draft import Draft
 from linkax.machines.machine import Machine
+from linkax.machines.mjcf import read_mjcf
 from linkax.machines.sdf import read_sdf
 from linkax.machines.urdf import close_by_yaml, read_urdf
 from linkax.machines.xml import Node, read_xml
@@ -14,6 +15,7 @@ from linkax.model.numbers import listed, one_of
 
 Base = Literal["free", "fixed"]
 READERS: dict[str, tuple[Callable[[Node, Draft], None], Base]] = {
+    "mujoco": (read_mjcf, "fixed"),
     "robot": (read_urdf, "fixed"),
     "sdf": (read_sdf, "free"),
 }

@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 ROUNDING = 1e-15  # entries of a rotation that are as near to 0, 1 or −1 as that are meant to be it
 
@@ -20,16 +19,22 @@ def pose(
 
 def from_angles(roll_pitch_yaw: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """R_z(yaw) R_y(pitch) R_x(roll), as URDF and SDF turn."""
+    from scipy.spatial.transform import Rotation  # SciPy takes its time
+
     return exact(Rotation.from_euler("xyz", roll_pitch_yaw).as_matrix())
 
 
 def from_quaternion(w_x_y_z: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
     """The rotation of a quaternion, (w, x, y, z), of any length but zero."""
+    from scipy.spatial.transform import Rotation
+
     return exact(Rotation.from_quat(w_x_y_z, scalar_first=True).as_matrix())
 
 
 def to_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     """The quaternion (w, x, y, z) of a rotation, with w ≥ 0."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
 
 

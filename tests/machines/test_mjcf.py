@@ -1,0 +1,227 @@
+"""Machines from MJCF: what MuJoCo compiles, as linkax computes it."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import linkax as lx
+from linkax.equations.configuration import configure
+from linkax.equations.dynamics import generalised_force, mass_matrix
+from linkax.equations.motion import move
+from linkax.equations.system import system_of
+
+MACHINES = Path(__file__).parents[1] / "data" / "machines"
+# A tree with all kinds of joints, several on one body, springs, dampers, rotors, a tendon and actuators; no loops.
+TREE = """<mujoco model="tree">
+  <compiler angle="degree"/>
+  <option gravity="0.3 -0.2 -9.81"><flag contact="disable"/></option>
+  <default>
+    <joint damping="0.3"/>
+    <default class="stiff"><joint stiffness="3" springref="20" armature="0.02"/></default>
+  </default>
+  <worldbody>
+    <body name="base" pos="0 0.1 1" euler="10 30 -20">
+      <freejoint name="float"/>
+      <geom type="box" size="0.2 0.1 0.05" density="700" pos="0.02 0 0.01" euler="0 20 0"/>
+      <body name="arm" pos="0.3 0 0" euler="0 0 40" gravcomp="0.4">
+        <joint name="yaw" class="stiff" axis="0 0 1" pos="-0.1 0 0" ref="15"/>
+        <joint name="lift" type="slide" axis="1 0 1" stiffness="50" springref="0.1"/>
+        <geom type="capsule" size="0.03" fromto="0 0 0 0.4 0 0" mass="0.8"/>
+        <body name="hand" pos="0.4 0 0">
+          <joint name="wrist" type="ball" pos="0.05 0 0"/>
+          <inertial pos="0.1 0.02 0" mass="0.5" fullinertia="0.004 0.005 0.006 0.0005 0.0002 -0.0001"/>
+          <site name="tip" pos="0.2 0 0"/>
+        </body>
+      </body>
+      <body name="tail" pos="-0.3 0 0">
+        <joint name="swing" class="stiff" axis="0 1 0.2"/>
+        <geom type="cylinder" size="0.05 0.2" pos="-0.1 0 0" euler="0 70 0"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="both" stiffness="4" damping="0.5" springlength="0.3">
+    <joint joint="yaw" coef="1.5"/><joint joint="swing" coef="-0.5"/></fixed></tendon>
+  <actuator>
+    <position name="servo" joint="yaw" kp="5" kv="0.3" gear="2"/>
+    <motor name="motor" joint="swing" gear="3"/>
+    <general name="general" tendon="both" biastype="affine" gaintype="affine" gainprm="2 0.3 0.1"
+      biasprm="0.1 -3 -0.4"/>
+  </actuator>
+</mujoco>"""
+CONTROLS = {"servo": 0.4, "motor": -0.2, "general": 0.7}
+
+
+def compiled(text):
+    """MuJoCo's model of a text, without the meshes that are not there."""
+    spec = mujoco.MjSpec.from_string(text)
+    missing = [mesh for mesh in spec.meshes if not (Path(spec.meshdir) / mesh.file).is_file()]
+    for geom in [geom for geom in spec.geoms if geom.meshname in [mesh.name for mesh in missing]]:
+        spec.delete(geom)
+    for mesh in missing:
+        spec.delete(mesh)
+    return spec.compile()
+
+
+def with_states(text, path, count, seed):
+    """MuJoCo's model of a text, random states of it, and a file that has them as keyframes."""
+    model = compiled(text)
+    rng = np.random.default_rng(seed)
+    words = lambda numbers: " ".join(map(repr, numbers.tolist()))
+    states = []
+    for _ in range(count):
+        qpos = np.array(model.qpos0)
+        mujoco.mj_integratePos(model, qpos, rng.normal(size=model.nv), 1.0)
+        states.append((qpos, rng.normal(size=model.nv)))
+    keys = "".join(f'<key qpos="{words(qpos)}" qvel="{words(qvel)}"/>' for qpos, qvel in states)
+    path.write_text(text.replace("</mujoco>", f"<keyframe>{keys}</keyframe></mujoco>"))
+    return model, states
+
+
+def state_of(mechanism, start):
+    """The state at a start, of joints in the tree alone."""
+    order = mechanism.topology.coordinates
+    flat = lambda given: np.concatenate([np.atleast_1d(given[name]) for name in order if name in given])
+    return lx.State(jnp.asarray(flat(start.positions)), jnp.asarray(flat(start.speeds)), mechanism.topology)
+
+
+def matrix_of_speeds(model, mechanism, names, qpos):
+    """The matrix from qvel, and qacc, to linkax's speeds: of balls and free bodies in the parent's axes."""
+    found = np.zeros((mechanism.topology.num_speeds, model.nv))
+    turn = lambda quaternion: Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    for index, name in enumerate(names):
+        joint = model.joint(index)
+        row, dof, at = mechanism.topology.speeds[name], joint.dofadr[0], joint.qposadr[0]
+        if joint.type[0] == mujoco.mjtJoint.mjJNT_FREE.value:
+            drawn = turn(model.body_quat[joint.bodyid[0]]).T
+            found[row.start : row.start + 3, dof + 3 : dof + 6] = drawn @ turn(qpos[at + 3 : at + 7])
+            found[row.start + 3 : row.stop, dof : dof + 3] = drawn
+        elif joint.type[0] == mujoco.mjtJoint.mjJNT_BALL.value:
+            found[row, dof : dof + 3] = turn(qpos[at : at + 4])
+        else:
+            found[row, dof] = 1.0
+    return found
+
+
+@jax.jit
+def tree_dynamics(mechanism, state):
+    configuration = configure(system_of(mechanism, np.float64), 0.0, state.q)
+    motion = move(configuration, state.v)
+    mass, force = mass_matrix(configuration), generalised_force(motion)
+    return mass, jnp.linalg.solve(mass, force), configuration.world_center_of_mass()
+
+
+def of_package(name, *disabled):
+    """The text of a machine of a package, with what MuJoCo's solver computes disabled."""
+    text = (MACHINES / f"{name}.xml").read_text()
+    flags = "".join(f' {what}="disable"' for what in ("contact", "limit", "frictionloss", "equality", *disabled))
+    text = text.replace('meshdir="meshes"', f'meshdir="{MACHINES / "meshes"}"')
+    return text.replace("<worldbody>", f"<option><flag{flags}/></option><worldbody>", 1)
+
+
+TREES = {
+    "of all joints": (TREE, CONTROLS),
+    "2F-85": (of_package("robotiq_2f85_v2"), {"fingers_actuator": 40.0}),
+    "xArm": (of_package("xarm7_gripper"), {"fingers_actuator": 60.0}),
+    "constraints": (of_package("constraints", "actuation"), {}),
+}
+
+
+@pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")
+@pytest.mark.parametrize("name", TREES)
+def test_a_tree_moves_as_in_mujoco(name, tmp_path):
+    """Places, mass matrix and acceleration at random states, to 1e-10 of the largest entry."""
+    text, controls = TREES[name]
+    model, states = with_states(text, tmp_path / "tree.xml", 20, seed=0)
+    machine = lx.load(tmp_path / "tree.xml", folders=[MACHINES], ignore=["contact", "tendon"])
+    mechanism = machine.mechanism({"forces": {name: {"control": value} for name, value in controls.items()}})
+    data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    of_file = {model.body(index).name: index for index in range(model.nbody)}
+    bodies = [of_file[name] for name in mechanism.topology.bodies if name in of_file]
+    named = [index for index, name in enumerate(mechanism.topology.bodies) if name in of_file]
+    for (qpos, qvel), start in zip(states, list(machine.starts.values())[-20:], strict=True):
+        data.qpos, data.qvel, data.ctrl = qpos, qvel, list(controls.values()) or 0.0
+        mujoco.mj_forward(model, data)
+        state = state_of(mechanism, start)
+        mass, acceleration, centers = tree_dynamics(mechanism, state)
+        into = matrix_of_speeds(model, mechanism, start.positions, data.qpos)
+        mujoco.mj_fullM(model, data, full)
+        assert np.abs(into @ data.qvel - state.v).max() < 1e-13
+        assert np.abs(centers[np.array(named)] - data.xipos[bodies]).max() < 1e-12
+        assert np.abs(into.T @ mass @ into - full).max() < 1e-10 * np.abs(full).max()
+        assert np.abs(into @ data.qacc - acceleration).max() < 1e-10 * np.abs(acceleration).max()
+
+
+def test_two_connects_between_the_same_bodies_are_a_hinge(tmp_path):
+    path = tmp_path / "four_bar.xml"
+    joint = '<joint name="{name}" axis="0 1 0"/>'
+    bar = f'<body name="{{name}}" pos="{{pos}}">{joint}<geom size="0.1" pos="{{at}}"/>{{inside}}</body>'
+    coupler = bar.format(name="coupler", pos="0 0 1", at="1 0 0", inside="")
+    crank = bar.format(name="crank", pos="0 0 0", at="0 0 1", inside=coupler)
+    rocker = bar.format(name="rocker", pos="2 0 0", at="0 0 1", inside="")
+    connects = "".join(f'<connect body1="coupler" body2="rocker" anchor="2 {y} 0"/>' for y in (-0.1, 0.1))
+    path.write_text(
+        f'<mujoco><option><flag contact="disable"/></option><worldbody>{crank}{rocker}</worldbody>'
+        f"<equality>{connects}</equality></mujoco>"
+    )
+    machine = lx.load(path)
+    topology = machine.mechanism().topology
+    assert [kind.__name__ for kind in topology.joint_types[topology.num_bodies :]] == ["Revolute"]
+    assert (topology.num_rows, topology.num_immobile_rows) == (2, 3)
+    state = lx.assemble(machine.mechanism(), {"crank": 0.4})
+    assert np.allclose(state.q, [0.4, 0.4, -0.4], atol=1e-12) or np.allclose(
+        sorted(abs(state.q)), [0.4] * 3, atol=1e-12
+    )
+
+
+@pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")
+@pytest.mark.parametrize(
+    ("name", "loops", "freedoms", "redundant"), [("robotiq_2f85_v2", 2, 3, 2), ("xarm7_gripper", 2, 1, 2)]
+)
+def test_grippers_close_their_loops(name, loops, freedoms, redundant):
+    mechanism = lx.load(MACHINES / f"{name}.xml").mechanism()
+    state = lx.assemble(mechanism, {"right_driver_joint": 0.3})
+    found = lx.mobility(mechanism, state)
+    assert (mechanism.topology.num_cuts, found.degrees_of_freedom, found.num_redundant) == (2, freedoms, 2)
+    assert lx.Solution.of_state(mechanism, state).worst_violation().position < 1e-12
+
+
+@pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")
+def test_every_equality_of_mujoco_is_read():
+    machine = lx.load(MACHINES / "constraints.xml", ignore=["contact", "tendon", "limit", "actuator"])
+    kinds = {part.name: part.kind.__name__ for part in (*machine.joints, *machine.constraints)}
+    read = {name: kinds[name] for name in ("c_site", "connect", "w_site", "weld", "joint", "tendon")}
+    assert read == {
+        "c_site": "Spherical", "connect": "Spherical", "w_site": "Fixed", "weld": "Fixed",
+        "joint": "PolynomialCoupling", "tendon": "PolynomialCoupling",
+    }  # fmt: skip
+
+
+def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):
+    (tmp_path / "tree.xml").write_text(TREE)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(lx.MachineFileError, match=r"pip install 'linkax\[files\]'"):
+        lx.load(tmp_path / "tree.xml")
+
+
+WRONG = (
+    ("<mujoco><worldbody><body/></mujoco>", r"broken.xml:1: no XML"),
+    ('<mujoco><worldbody><body><joint type="belt"/></body></worldbody></mujoco>', "MuJoCo does not read it.*line 1"),
+    ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", "MuJoCo does not read it"),
+    ('<mujoco><include file="../../etc/passwd"/></mujoco>', "include: .* lies outside of the file's folder"),
+    ('<mujoco><include file="broken.xml"/></mujoco>', "files include each other"),
+    ('<mujoco><asset><mesh file="/etc/hosts"/></asset></mujoco>', "mesh: .* lies outside of the file's folder"),
+)
+
+
+@pytest.mark.parametrize(("text", "message"), WRONG)
+def test_a_broken_file_is_named_with_its_line(tmp_path, text, message):
+    path = tmp_path / "broken.xml"
+    path.write_text(text)
+    with pytest.raises(lx.MachineFileError, match=message):
+        lx.load(path)
