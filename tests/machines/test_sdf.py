@@ -29,6 +29,12 @@ def test_cassie_closes_its_loops(name):
     assert violation.position < 1e-12
 
 
+def test_whole_angles_make_planar_loops_of_those_that_are_meant_so():
+    """A leg's loop from crank to foot turns about one direction, on the right but for the digits of its angles."""
+    rounded, whole = (cassie("cassie_v2", whole_angles=given).mechanism().topology for given in (False, True))
+    assert (rounded.num_immobile_rows, whole.num_immobile_rows) == (1, 2)
+
+
 @pytest.mark.parametrize("name", ["cassie", "cassie_reduced", "cassie_simple"])
 def test_other_cassies_load(name):
     machine = cassie(name, ignore=["contact", "limit", "inertia", "joint"])

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from linkax.machines.machine import LeftOut, Machine, Start
 from linkax.machines.parts import Part, Place, ground
-from linkax.machines.poses import relative, turned
+from linkax.machines.poses import relative, turned, whole
 from linkax.machines.xml import MachineFileError, Where
 from linkax.model.bodies import GROUND_NAME, RigidBody
 from linkax.model.forces.contact_law import ContactLaw
@@ -35,11 +35,13 @@ class Draft:
 
     - `ignore`: kinds of things that are left out where the file has them.
     - `folders`: below which other files may be read.
+    - `whole_angles`: whether angles that are rounded are taken as what they stand for.
     """
 
     path: Path
     ignore: tuple[str, ...]
     folders: tuple[Path, ...]
+    whole_angles: bool
     name: str = ""
     bodies: list[Part] = dataclasses.field(default_factory=list)
     joints: list[Part] = dataclasses.field(default_factory=list)
@@ -51,6 +53,10 @@ class Draft:
     missing: list[LeftOut] = dataclasses.field(default_factory=list)
     outside: list[str] = dataclasses.field(default_factory=list)
     _taken: set[tuple[int, str]] = dataclasses.field(default_factory=set)
+
+    def angles(self, given: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Angles of a file, [rad], (3,)."""
+        return np.array([whole(float(angle)) for angle in given]) if self.whole_angles else given
 
     def leave_out(self, where: Where, kind: str, reason: str, changes_motion: bool = True) -> None:
         """Note what is left out; what changes the motion must be in `ignore`."""

@@ -11,7 +11,7 @@ from linkax.machines.mjcf import read_mjcf
 from linkax.machines.sdf import read_sdf
 from linkax.machines.urdf import close_by_yaml, read_urdf
 from linkax.machines.xml import Node, read_xml
-from linkax.model.numbers import listed, one_of
+from linkax.model.numbers import listed, one_of, require_bool
 
 Base = Literal["free", "fixed"]
 READERS: dict[str, tuple[Callable[[Node, Draft], None], Base]] = {
@@ -29,6 +29,7 @@ def load(
     base: Base | None = None,
     closures: str | os.PathLike[str] | None = None,
     folders: Iterable[str | os.PathLike[str]] = (),
+    whole_angles: bool = False,
 ) -> Machine:
     """Read a machine from a file: MJCF, SDF or URDF, with its closed loops.
 
@@ -59,13 +60,15 @@ def load(
     - `closures`: for URDF, a YAML file of pairs of links that coincide: `closed_loop: [[a, b], ...]`, with
       `type: [3d, ...]` for points, or 6d.
     - `folders`: further ones below which files may be read, such as those of meshes.
+    - `whole_angles`: take angles that are rounded multiples of 15 degrees, such as 1.5708 or 1.57 for π/2, as what they
+      stand for. Axes that are meant to be parallel then are, and a planar loop is not locked by the digits of the file.
 
     **Raises:** `MachineFileError`, a `ValueError`, with file, line and element: for a file that cannot be read, and for
     what changes the motion, is not modelled, and not in `ignore`.
     """
     path = Path(path)
     ignored = (ignore,) if isinstance(ignore, str) else listed(ignore, str, "ignore", 'give words such as ["contact"]')
-    draft = Draft(path, tuple(ignored), (path.parent, *map(Path, folders)))
+    draft = Draft(path, tuple(ignored), (path.parent, *map(Path, folders)), require_bool(whole_angles, "whole_angles"))
     usual = _read(draft)
     if closures is not None:
         close_by_yaml(draft, Path(closures))

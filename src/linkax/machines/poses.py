@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+STEP = np.pi / 12
+FEWEST_DECIMALS = 2
 ROUNDING = 1e-15  # entries of a rotation that are as near to 0, 1 or −1 as that are meant to be it
 
 
@@ -22,6 +24,12 @@ def from_angles(roll_pitch_yaw: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 
     from scipy.spatial.transform import Rotation  # SciPy takes its time
 
     return exact(Rotation.from_euler("xyz", roll_pitch_yaw).as_matrix())
+
+
+def whole(angle: float) -> float:
+    """The multiple of 15 degrees that an angle is when rounded to its decimals, such as π/2 for 1.5708; else itself."""
+    multiple, decimals = round(angle / STEP) * STEP, len(repr(angle).partition(".")[2])
+    return multiple if decimals >= FEWEST_DECIMALS and round(multiple, decimals) == angle else angle
 
 
 def from_quaternion(w_x_y_z: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:

@@ -74,7 +74,7 @@ class _Model:
 
     def __init__(self, node: Node, draft: Draft, prefix: str, gravity: Float[np.ndarray, "3"], version: float) -> None:
         self.node, self.draft, self.prefix, self.gravity, self.version = node, draft, prefix, gravity, version
-        self.own = _raw_pose(node)
+        self.own = self._raw_pose(node)
         self.nodes = {child.name: child for child in node.all("link", "joint", "frame")}
         if len(self.nodes) < len(node.all("link", "joint", "frame")):
             names = [child.name for child in node.all("link", "joint", "frame")]
@@ -126,7 +126,7 @@ class _Model:
             way.append(name)
             asked_by, name = node, self._reference(node)
         for each in reversed(way):
-            self.found[each] = self.found[self._reference(self.nodes[each])] @ _raw_pose(self.nodes[each])
+            self.found[each] = self.found[self._reference(self.nodes[each])] @ self._raw_pose(self.nodes[each])
         return self.found[way[0] if way else name]
 
     def _reference(self, node: Node) -> str:
@@ -148,7 +148,7 @@ class _Model:
         inertial = node.find("inertial")
         if inertial is not None and inertial.attributes.get("auto", "false") in ("true", "1"):
             draft.leave_out(inertial.where, "inertial", "mass and inertia from the shape of collisions")
-        at = _raw_pose(inertial) if inertial is not None else np.eye(4)
+        at = self._raw_pose(inertial) if inertial is not None else np.eye(4)
         mass = 1.0 if inertial is None else inertial.number("mass", 1.0)
         entry = lambda name, default: default if inertial is None else inertial.number(f"inertia/{name}", default)
         xx, yy, zz = (entry(name, 1.0) for name in ("ixx", "iyy", "izz"))
@@ -243,6 +243,19 @@ class _Model:
             return direction
         return relative(self.pose_of(named, axis), frame)[:3, :3] @ direction
 
+    def _raw_pose(self, node: Node) -> Pose:
+        """The numbers in the <pose> of an element."""
+        given = node.find("pose")
+        if given is None or not given.text.strip():
+            return np.eye(4)
+        if given.attributes.get("rotation_format", "euler_rpy") == "quat_xyzw":
+            numbers = read_numbers(given.text, 7, given.where)
+            return pose(numbers[:3], from_quaternion(numbers[[6, 3, 4, 5]]))
+        numbers = read_numbers(given.text, 6, given.where)
+        if given.attributes.get("degrees", "false") in ("1", "true"):
+            return pose(numbers[:3], from_angles(np.radians(numbers[3:])))
+        return pose(numbers[:3], from_angles(self.draft.angles(numbers[3:])))
+
     def _gearbox(self, node: Node) -> None:
         """θ₁ = −ratio θ₂, of parent and child seen from the reference body, about <axis> and <axis2>."""
         draft, where = self.draft, node.where
@@ -304,16 +317,3 @@ def _pitch(node: Node) -> float:
     if node.find("screw_thread_pitch") is not None:
         return node.number("screw_thread_pitch") / (2.0 * np.pi)
     return -1.0 / node.number("thread_pitch", 1.0)
-
-
-def _raw_pose(node: Node) -> Pose:
-    """The numbers in the <pose> of an element."""
-    given = node.find("pose")
-    if given is None or not given.text.strip():
-        return np.eye(4)
-    if given.attributes.get("rotation_format", "euler_rpy") == "quat_xyzw":
-        numbers = read_numbers(given.text, 7, given.where)
-        return pose(numbers[:3], from_quaternion(numbers[[6, 3, 4, 5]]))
-    numbers = read_numbers(given.text, 6, given.where)
-    angles = np.radians(numbers[3:]) if given.attributes.get("degrees", "false") in ("1", "true") else numbers[3:]
-    return pose(numbers[:3], from_angles(angles))

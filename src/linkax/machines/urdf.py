@@ -98,14 +98,20 @@ class _Robot:
             link = self.carrier[link][0]
         found = self.draft.poses.get(link, np.eye(4))
         for each in reversed(way):
-            found = found @ _origin(self.joints[self.carrier[each][1]].find("origin"))
+            found = found @ self._origin(self.joints[self.carrier[each][1]].find("origin"))
         return found
+
+    def _origin(self, node: Node | None) -> Pose:
+        """The pose in an <origin>."""
+        if node is None:
+            return np.eye(4)
+        return pose(node.numbers("xyz", 3, ZERO), from_angles(self.draft.angles(node.numbers("rpy", 3, ZERO))))
 
     def _body(self, node: Node) -> None:
         inertial = node.find("inertial")
         mass, at, inertia = 0.0, np.eye(4), np.zeros((3, 3))
         if inertial is not None:
-            at, mass = _origin(inertial.find("origin")), float(inertial.child("mass").numbers("value", 1)[0])
+            at, mass = self._origin(inertial.find("origin")), float(inertial.child("mass").numbers("value", 1)[0])
             entry = lambda name: float(inertial.child("inertia").numbers(name, 1, [0.0])[0])
             xx, yy, zz, xy, xz, yz = map(entry, ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
             inertia = turned(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), at[:3, :3])
@@ -125,7 +131,7 @@ class _Robot:
         if KINDS[kind] in WITH_AXIS:
             arguments["axis"] = _axis(node.find("axis"))
         ends = (
-            Place.at(self._link(node, "parent"), _origin(node.find("origin"))),
+            Place.at(self._link(node, "parent"), self._origin(node.find("origin"))),
             Place.at(self._link(node, "child"), np.eye(4)),
         )
         draft.joint_at(KINDS[kind], node.name, *ends, where, **arguments)
@@ -153,10 +159,10 @@ class _Robot:
     def _end(self, node: Node, *tags: str) -> Place:
         """The place of one end of a <loop>."""
         tag = next((tag for tag in tags if node.find(tag) is not None), tags[0])
-        return Place.at(self._link(node, tag), _origin(node.child(tag).find("origin")))
+        return Place.at(self._link(node, tag), self._origin(node.child(tag).find("origin")))
 
     def _constraint(self, node: Node) -> None:
-        place = lambda end: Place.at(self._link(node, end), _origin(node.find(f"{end}_origin")))
+        place = lambda end: Place.at(self._link(node, end), self._origin(node.find(f"{end}_origin")))
         self._loop(
             node,
             place("parent"),
@@ -230,12 +236,6 @@ def close_by_yaml(draft: Draft, path: Path) -> None:
             raise where.error(f"type {kind!r} of {pair!r} is not known; known: {', '.join(OF_YAML)}")
         first, second = (Place.at(str(link), np.eye(4)) for link in pair)
         draft.joint_at(OF_YAML[str(kind).lower()], f"closed_loop[{index}]", first, second, where, cut=True)
-
-
-def _origin(node: Node | None) -> Pose:
-    if node is None:
-        return np.eye(4)
-    return pose(node.numbers("xyz", 3, ZERO), from_angles(node.numbers("rpy", 3, ZERO)))
 
 
 def _axis(node: Node | None):
