@@ -1,9 +1,9 @@
 """Machines from files: what is found in them, and their motion beside other tools that read the same file.
 
 `found`: of each file loops, degrees of freedom, redundant rows, and how far open `linkax.assemble` leaves loops,
-relative to their length. `pinocchio`: accelerations against `constraintDynamics`, a proximal solve with hard loops, of a
-model with the same numbers, at twenty states of a motion. `mujoco`: how far a motion is from MuJoCo's, whose equalities
-are soft, as they are stiffened with shorter steps.
+relative to their length. `pinocchio`: accelerations against `constraintDynamics`, a proximal solve with hard loops, of
+a model with the same numbers, at twenty states of a motion. `mujoco`: how far a motion is from MuJoCo's, whose
+equalities are soft, as they are stiffened with shorter steps.
 
 `python -m benchmarks.machines [PART ...]` prints one JSON object.
 """
