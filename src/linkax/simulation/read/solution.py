@@ -1,5 +1,6 @@
 """The motion that a simulation found, and what can be read from it."""
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -33,6 +34,7 @@ from linkax.simulation.read.by_name import (
     reaction_of,
     states_of,
 )
+from linkax.simulation.read.columns import save, to_dataframe
 from linkax.simulation.read.interpolation import motion_at
 from linkax.simulation.read.kinematics import Kinematics
 from linkax.simulation.read.observables import Observables, Power, Violation
@@ -337,6 +339,27 @@ class Solution(Kinematics):
         **Raises:** `ValueError` for a batch, or where functions of one's own were saved.
         """
         return passages(self)
+
+    def to_dataframe(self) -> Any:
+        """The motion as a `pandas.DataFrame`, of one run, at the times that were reached.
+
+        Its columns are `time`; `joint.NAME` and `speed.NAME` of each joint in the tree, with a last `.0`, `.1`, … where it
+        has several, of a quaternion `.w`, `.x`, `.y`, `.z`; and `position.NAME.x`, `.y`, `.z` of the centre of mass of
+        each body, in ground axes. Its `attrs["units"]` has the unit of each column.
+
+        **Raises:** `ImportError` without pandas; `ValueError` for a batch, and for a `SaveAt` with functions.
+        """
+        return to_dataframe(self)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the columns of `to_dataframe` to a file that other tools read: whole, or not at all.
+
+        **Arguments:** `path`: with the suffix `.csv`, `.parquet` (by pyarrow, units in the metadata of the columns), or
+        `.zarr` (a group with an array for each column, units in the attributes).
+
+        **Raises:** `ValueError` for another suffix, and as `to_dataframe`; `ImportError` for Parquet without pyarrow.
+        """
+        save(self, path)
 
     def at(self, ts: Vector | list[Number]) -> "Solution":
         """The same motion at other times between the saved ones, to be read as this one.
