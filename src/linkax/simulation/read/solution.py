@@ -343,9 +343,9 @@ class Solution(Kinematics):
     def to_dataframe(self) -> Any:
         """The motion as a `pandas.DataFrame`, of one run, at the times that were reached.
 
-        Its columns are `time`; `joint.NAME` and `speed.NAME` of each joint in the tree, with a last `.0`, `.1`, … where it
-        has several, of a quaternion `.w`, `.x`, `.y`, `.z`; and `position.NAME.x`, `.y`, `.z` of the centre of mass of
-        each body, in ground axes. Its `attrs["units"]` has the unit of each column.
+        Its columns are `time`; `joint.NAME` and `speed.NAME` of each joint in the tree, with a last `.0`, `.1`, …
+        where it has several, of a quaternion `.w`, `.x`, `.y`, `.z`; and `position.NAME.x`, `.y`, `.z` of the centre of
+        mass of each body, in ground axes. Its `attrs["units"]` has the unit of each column.
 
         **Raises:** `ImportError` without pandas; `ValueError` for a batch, and for a `SaveAt` with functions.
         """
