@@ -57,6 +57,23 @@ TREE = """<mujoco model="tree">
 CONTROLS = {"servo": 0.4, "motor": -0.2, "general": 0.7}
 
 
+def positions_in_mujoco(model, machine, mechanism, state):
+    """qpos at a state."""
+    qpos, drawn = np.array(model.qpos0), dict(machine.starts)["key"].positions
+    for index, name in enumerate(drawn):
+        joint, at = model.joint(index), model.joint(index).qposadr[0]
+        q = np.array(state.q[mechanism.topology.coordinates[name]])
+        if joint.type[0] == mujoco.mjtJoint.mjJNT_FREE.value:
+            here = Rotation.from_quat(qpos[at + 3 : at + 7], scalar_first=True)
+            turned = here * Rotation.from_quat(q[:4], scalar_first=True)
+            qpos[at : at + 7] = [*(qpos[at : at + 3] + here.apply(q[4:])), *turned.as_quat(scalar_first=True)]
+        elif joint.type[0] == mujoco.mjtJoint.mjJNT_BALL.value:
+            qpos[at : at + 4] = q
+        else:
+            qpos[at] += q[0]
+    return qpos
+
+
 def compiled(text):
     """MuJoCo's model of a text, without the meshes that are not there."""
     spec = mujoco.MjSpec.from_string(text)
@@ -200,6 +217,22 @@ def test_every_equality_of_mujoco_is_read():
         "c_site": "Spherical", "connect": "Spherical", "w_site": "Fixed", "weld": "Fixed",
         "joint": "PolynomialCoupling", "tendon": "PolynomialCoupling",
     }  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")
+def test_equalities_hold_in_mujoco_where_loops_are_closed():
+    """Of connects, welds at any pose, between bodies and sites, and of polynomials of joints."""
+    machine = lx.load(MACHINES / "constraints.xml", ignore=["contact", "tendon", "limit", "actuator"])
+    mechanism = machine.mechanism()
+    state = lx.assemble(mechanism)
+    model = compiled((MACHINES / "constraints.xml").read_text())
+    data = mujoco.MjData(model)
+    data.qpos = positions_in_mujoco(model, machine, mechanism, state)
+    mujoco.mj_forward(model, data)
+    held = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY.value
+
+    assert held.sum() == 3 + 3 + 6 + 6 + 1 + 1
+    assert np.abs(data.efc_pos[: data.nefc][held]).max() < 1e-9
 
 
 def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):

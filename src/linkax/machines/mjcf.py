@@ -311,8 +311,8 @@ class _Compiled:
         first, second = (self.body_names[body] for body in objects)
         if not is_weld:
             return Place(first, data[:3], np.eye(3)), Place(second, data[3:6], np.eye(3))
-        on_second = pose(data[:3])  # the anchor, where the weld holds
-        return Place.at(first, pose(data[3:6], from_quaternion(data[6:10])) @ on_second), Place.at(second, on_second)
+        turn = from_quaternion(data[6:10])  # of the second body, seen from the first; the anchor is on both
+        return Place(first, data[3:6], turn), Place(second, data[:3], np.eye(3))
 
     def _connects(
         self, connects: list[tuple[int, Place, Place]], names: Sequence[str], places: Sequence[Where]
