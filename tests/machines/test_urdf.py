@@ -123,6 +123,15 @@ def test_stops_and_dampers(tmp_path):
     assert "crank_bearing.limit" not in without.params["forces"]
 
 
+def test_words_to_ignore_are_checked(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"ignore has 'limits' \(did you mean 'limit'\?\), which nothing in the file is"
+    ):
+        load(tmp_path, ignore=["limits"])
+    with pytest.raises(ValueError, match="ignore is 3; give words"):
+        load(tmp_path, ignore=3)
+
+
 WRONG = (
     ('<joint name="a" type="fixed"><parent link="frame"/><child link="nobody"/></joint>', r":15: child: .*'nobody'"),
     (

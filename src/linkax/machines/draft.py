@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.machines.machine import LeftOut, Machine, Start
-from linkax.machines.parts import Part, Place, ground
+from linkax.machines.parts import Part, Place, ground, meant
 from linkax.machines.poses import relative, turned, whole
 from linkax.machines.xml import MachineFileError, Where
 from linkax.model.bodies import GROUND_NAME, RigidBody
@@ -26,6 +26,7 @@ Pose = Float[np.ndarray, "4 4"]
 STOP_DEPTH = 1e-3  # how far the weight of a machine presses a stop whose stiffness no file gives [rad or of its size]
 STOP_RESTITUTION = 0.1  # of such a stop, hit with 1 rad/s, or one size a second
 FRICTION_SPEED = 1e-2  # below which dry friction along a joint is nearly viscous [rad/s, or of the size a second]
+KINDS = ("contact", "limit", "spring", "damping", "friction", "actuator", "inertia", "joint", "equality", "tendon")
 SHOWN = 4  # things left out that a warning names
 
 
@@ -178,8 +179,16 @@ class Draft:
     def machine(self, base: str) -> Machine:
         """Make the machine: bodies that nothing holds get a joint to the ground, a free or a fixed one.
 
-        **Raises:** `MachineFileError` for what the file asks for, changes the motion, and is not in `ignore`.
+        **Raises:** `MachineFileError` for what the file asks for, changes the motion, and is not in `ignore`;
+        `ValueError` for a word in `ignore` that is no kind of thing.
         """
+        present = {item.kind for item in (*self.left_out, *self.missing)}
+        for kind in self.ignore:
+            if kind not in KINDS and kind not in present:
+                known = ", ".join(sorted({*KINDS, *present}))
+                raise ValueError(
+                    f"ignore has {kind!r}{meant(kind, KINDS)}, which nothing in the file is; known: {known}"
+                )
         if self.missing:
             listed = "\n  ".join(map(str, self.missing))
             kinds = ", ".join(f'"{kind}"' for kind in dict.fromkeys(item.kind for item in self.missing))
