@@ -219,7 +219,8 @@ class Draft:
 
     def _hold(self, base):
         """Join to the ground the first body of each part that nothing holds there."""
-        reached = _connected(self.joints, GROUND_NAME)
+        carrying = [joint for joint in self.joints if joint.kind.can_carry]
+        reached = _connected(carrying, GROUND_NAME)
         for body in self.bodies:
             if body.name in reached:
                 continue
@@ -228,7 +229,7 @@ class Draft:
             self.joints.insert(
                 0, Part(kind, {"name": f"{body.name}.{word}", "parent": ground(pose), "child": child}, body.where)
             )
-            reached |= _connected(self.joints, body.name)
+            reached |= _connected(carrying, body.name)
 
     @property
     def size(self) -> float:

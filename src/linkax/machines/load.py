@@ -10,6 +10,7 @@ from linkax.machines.machine import Machine
 from linkax.machines.mjcf import read_mjcf
 from linkax.machines.sdf import read_sdf
 from linkax.machines.urdf import close_by_yaml, read_urdf
+from linkax.machines.usd import SUFFIXES, read_usd
 from linkax.machines.xml import Node, read_xml
 from linkax.model.numbers import listed, one_of, require_bool
 
@@ -19,7 +20,6 @@ READERS: dict[str, tuple[Callable[[Node, Draft], None], Base]] = {
     "robot": (read_urdf, "fixed"),
     "sdf": (read_sdf, "free"),
 }
-USD = (".usd", ".usda", ".usdc", ".usdz")
 
 
 def load(
@@ -31,7 +31,7 @@ def load(
     folders: Iterable[str | os.PathLike[str]] = (),
     whole_angles: bool = False,
 ) -> Machine:
-    """Read a machine from a file: MJCF, SDF or URDF, with its closed loops.
+    """Read a machine from a file: MJCF, SDF, URDF or USD, with its closed loops.
 
     ```python
     machine = lx.load("gripper.xml")
@@ -41,7 +41,8 @@ def load(
 
     Loops are found, whatever the file says of the tree: SDF and URDF may give a link several parents, URDF also the
     elements <loop>, <coupling> and <constraint>, MJCF <equality>, whose two <connect> between the same bodies make a
-    hinge. Coordinates are zero where the machine stands as drawn.
+    hinge. Coordinates are zero where the machine stands as drawn; in USD where a joint's two frames coincide, and
+    `Machine.starts["drawn"]` has those of the drawing where it is another place.
 
     What linkax does not model is in `Machine.left_out`. Where that changes the motion it must be in `ignore`, and a
     warning (`LeftOutWarning`) names some of it. Stops and dry friction have laws of linkax: where the file does not say
@@ -52,11 +53,12 @@ def load(
 
     **Arguments:**
 
-    - `path`: of the file. MJCF needs MuJoCo (`pip install "linkax[files]"`), which reads it.
+    - `path`: of the file. MJCF needs MuJoCo (`pip install "linkax[files]"`), which reads it, and
+      USD (.usd, .usda, .usdc, .usdz) its usd-core.
     - `ignore`: kinds of things to leave out. By default "contact", between any shapes; also "limit", "spring",
       "damping", "friction" and "actuator", which linkax has, and what an error names.
     - `base`: "free" or "fixed": how the first body of what nothing joins to the ground moves. By default "free" in
-      SDF, "fixed" in URDF and MJCF.
+      SDF and USD, "fixed" in URDF and MJCF.
     - `closures`: for URDF, a YAML file of pairs of links that coincide: `closed_loop: [[a, b], ...]`, with
       `type: [3d, ...]` for points, or 6d.
     - `folders`: further ones below which files may be read, such as those of meshes.
@@ -77,6 +79,9 @@ def load(
 
 def _read(draft: Draft) -> Base:
     """Fill a draft, and return how a base moves that the format does not join to the ground."""
+    if draft.path.suffix.lower() in SUFFIXES:
+        read_usd(draft)
+        return "free"
     root = read_xml(draft.path)
     if root.tag not in READERS:
         raise root.where.error(f"the file is no machine; it must begin with {', '.join(f'<{tag}>' for tag in READERS)}")
