@@ -1,12 +1,13 @@
 """Machines from USD Physics: units, joints, drives, mass from shapes, and files that are refused."""
 
+import importlib
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
-from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 import linkax as lx
 from linkax.equations.configuration import configure
@@ -14,6 +15,10 @@ from linkax.equations.dynamics import generalised_force, mass_matrix
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
 
+MODULES: list[Any] = [
+    importlib.import_module(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom", "UsdPhysics", "UsdUtils")
+]
+Gf, Usd, UsdGeom, UsdPhysics, UsdUtils = MODULES
 FOUR_BAR = Path(__file__).parents[1] / "data" / "machines" / "boxes_fourbar.usda"
 pytestmark = pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")
 
