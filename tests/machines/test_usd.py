@@ -37,7 +37,7 @@ def by_hand():
         ((half, 0.0, 0.0), (0.0, 0.0, -half)), ((0.0, 0.0, top), (half, 0.0, 0.0)),
         ((-half, 0.0, 0.0), (0.0, 0.0, top)), ((0.0, 0.0, -half), (-half, 0.0, 0.0)),
     )  # fmt: skip
-    joints = [lx.Free("body_1.free", lx.GROUND.at((0.0, 0.0, 0.004999999888241291)), bars[0])]
+    joints: list[Any] = [lx.Free("body_1.free", lx.GROUND.at((0.0, 0.0, 0.004999999888241291)), bars[0])]
     for count, (first, second) in enumerate(ends):
         pair = bars[count].at(first), bars[(count + 1) % 4].at(second)
         joints.append(lx.Revolute(f"joint_{count + 1}", *pair, axis="y"))
