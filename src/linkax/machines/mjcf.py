@@ -11,11 +11,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from linkax.machines.draft import Draft, Pose
 from linkax.machines.machine import Start
 from linkax.machines.parts import Place
-from linkax.machines.poses import from_quaternion, pose, relative, to_quaternion, turned
+from linkax.machines.poses import exact, from_quaternion, pose, relative, to_quaternion, turned
 from linkax.machines.xml import MachineFileError, Node, Where, below, read_xml
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.constraints.constraint import Coupling
@@ -319,12 +320,13 @@ class _Compiled:
     ) -> None:
         """Balls at the points where two bodies are connected; two points make a hinge."""
         if len(connects) == 2:
-            (index, first, second), (_, other, _) = connects
+            (index, first, second), (_, other, other_second) = connects
             axis = other.offset - first.offset
             if np.linalg.norm(axis) > SHORTEST:
-                turn = relative(self.draft.poses[first.body], self.draft.poses[second.body])[:3, :3]
-                child = Place(second.body, second.offset, turn)
-                self.draft.joint_at(Revolute, names[index], first, child, places[index], axis=axis, cut=True)
+                drawn = relative(self.draft.poses[first.body], self.draft.poses[second.body])[:3, :3]
+                turn = _turn_between(drawn @ axis, other_second.offset - second.offset) @ drawn
+                parent, child = Place(first.body, first.offset, np.eye(3)), Place(second.body, second.offset, turn)
+                self.draft.joint_at(Revolute, names[index], parent, child, places[index], axis=axis, cut=True)
                 return
         for index, first, second in connects:
             self.draft.joint_at(Spherical, names[index], first, second, places[index], cut=True)
@@ -457,3 +459,15 @@ class _Compiled:
     def _free_frame(self, joint: int) -> Pose:
         """The parent's frame of a free joint in the world, where the file draws its body."""
         return self.draft.poses[self.body_names[self.model.jnt_bodyid[joint]]]
+
+
+def _turn_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The shortest rotation from one direction to another; two sites may be drawn where their loop is open."""
+    from scipy.spatial.transform import Rotation
+
+    across = np.cross(first, second)
+    angle, size = np.arctan2(np.linalg.norm(across), first @ second), np.linalg.norm(across)
+    if size == 0.0 and angle > 0.0:  # opposite: half a turn about any axis across
+        across = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
+        size = np.linalg.norm(across)
+    return exact(Rotation.from_rotvec(across * (angle / size)).as_matrix()) if size else np.eye(3)
