@@ -45,7 +45,7 @@ BAD = {
     "simulate pendulum --rtol nan": "not a positive",
     "simulate pendulum --t1 -3": "positive, finite",
     "simulate crank-slider --set rod=0.5 --set angle=1.5": "parameters of scene 'crank-slider' by --set NAME",
-    "fly": "unknown command 'fly'; known: list, simulate, inspect, compare, sweep",
+    "fly": "unknown command 'fly'; known: list, simulate, inspect, convert, compare, sweep",
     "": "COMMAND",
 }
 

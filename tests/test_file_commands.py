@@ -2,6 +2,7 @@
 
 import json
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -53,6 +54,16 @@ def test_simulate_takes_a_file(file, capsys, tmp_path):
     assert run(["simulate", file, *settings, "--out", str(tmp_path / "held"), "--hold", "crank_bearing=0.2"]) == 0
     rocker = json.loads(capsys.readouterr().out)["final"]["rocker"]
     assert np.allclose(rocker, [2.0 + 0.5 * np.sin(0.2), 0.0, 0.5 * np.cos(0.2)], atol=1e-12)
+
+
+def test_convert_writes_what_mujoco_reads(file, capsys, tmp_path):
+    target = tmp_path / "four_bar.xml"
+    assert run(["convert", file, str(target)]) == 0
+    assert "written" in capsys.readouterr().out
+    model = mujoco.MjModel.from_xml_path(str(target))
+    assert (model.nv, model.nkey) == (3, 1)
+    assert run(["convert", file, str(tmp_path / "four_bar.sdf")]) == 2
+    assert "MJCF is written to .xml" in capsys.readouterr().err
 
 
 BAD = (

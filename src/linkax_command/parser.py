@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
-COMMANDS = ("list", "simulate", "inspect", "compare", "sweep")
+COMMANDS = ("list", "simulate", "inspect", "convert", "compare", "sweep")
 PRESETS = ("draft", "balanced", "precise")
 SOLVERS = ("tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5", "rodas5p", "rk4")
 EQUAL = ("tolerance", "cost")
@@ -66,6 +66,13 @@ def parsed(argv: Sequence[str] | None = None) -> argparse.Namespace:
     inspect.add_argument("--variant", metavar="START", help="a start that the file names (default: as drawn)")
     _add_file_options(inspect)
     inspect.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
+    convert = commands.add_parser("convert", help="write the machine of a file as MJCF, for MuJoCo")
+    convert.add_argument("scene", metavar="IN", type=_scene, help=FILES)
+    convert.add_argument("target", metavar="OUT", type=_path, help="the file to write, with suffix .xml")
+    convert.add_argument("--variant", metavar="START", help="a start that the file names (default: as drawn)")
+    _add_file_options(convert)
+    leave = "an element that MuJoCo does not have, by name or type, to leave out of OUT"
+    convert.add_argument("--leave", action="append", default=[], metavar="NAME", help=leave)
     compare = commands.add_parser(
         "compare",
         help="integrate a scene by all formulations, and compare errors, violations and cost",

@@ -10,12 +10,19 @@ import jax
 
 import linkax as lx
 from linkax.cli.compare import run_compare
+from linkax.cli.convert import run_convert
 from linkax.cli.inspect import run_inspect
 from linkax.cli.simulate import run_simulate
 from linkax.cli.sweep import run_sweep
 from linkax.xla.users_line import warn
 
-COMMANDS = {"simulate": run_simulate, "inspect": run_inspect, "compare": run_compare, "sweep": run_sweep}
+COMMANDS = {
+    "simulate": run_simulate,
+    "inspect": run_inspect,
+    "convert": run_convert,
+    "compare": run_compare,
+    "sweep": run_sweep,
+}
 
 
 def run(arguments: argparse.Namespace, at_interrupt: Callable[[Callable[[], str]], None]) -> int:
