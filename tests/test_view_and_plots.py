@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import diffrax
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -174,6 +175,29 @@ def test_one_state_is_shown_without_time(browser, crank_slider, tmp_path):
     end = solution.position("slider")[-1]
     np.testing.assert_allclose(shown.ask("linkax.position('slider')"), end, atol=1e-6)
     assert (tmp_path / "state.html").read_text() == view.html
+
+
+def test_bodies_are_drawn_as_their_shapes(browser, tmp_path):
+    """A box and a mesh of a file, which turn with their body and tell its name, in their own colours."""
+    corners = np.array([[0.0, -0.2, 0.0], [1.0, -0.2, 0.0], [0.5, -0.2, 1.0], [0.5, 0.4, 0.4]])
+    trimesh.Trimesh(corners, [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]).export(tmp_path / "part.stl")
+    shapes = [
+        lx.Shape("box", [0.6, 0.4, 0.2], [-0.5, 0.0, 0.0], colour=[0.9, 0.0, 0.0, 1.0]),
+        lx.Shape("mesh", position=[0.5, 0.0, 0.0], mesh=tmp_path / "part.stl", colour=[0.0, 0.7, 0.0, 1.0]),
+    ]
+    arm = lx.RigidBody("arm", 2.0, inertia=[0.1, 0.1, 0.1], shape=shapes)
+    hinge = lx.Revolute("hinge", lx.GROUND, arm, axis="y")
+    mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, 0.0, -9.81])])
+    shown = opened(browser, mechanism.view(lx.State(np.array([np.pi]), np.zeros(1))), tmp_path)
+    seen = picture(shown)
+    for place, channel in (([0.5, 0.0, 0.0], 0), ([-1.0, 0.0, -0.4], 1)):  # after half a turn about y
+        x, y = shown.ask(f"linkax.pixel({place})")
+        red_green_blue = seen[round(y), round(x)]
+        assert np.argmax(red_green_blue) == channel
+        assert red_green_blue[channel] > 2.0 * np.delete(red_green_blue, channel).max()
+        shown.page.mouse.move(x, y)
+        assert shown.page.locator("#tip").text_content() == "arm: body, 2 kg"
+    assert not shown.errors
 
 
 def test_a_notebook_shows_the_page_in_a_frame(browser, crank_slider, tmp_path):

@@ -137,6 +137,7 @@ from linkax.model.sections import Material as Material  # noqa: E402
 from linkax.model.sections import Section as Section  # noqa: E402
 from linkax.model.sections import circle as circle  # noqa: E402
 from linkax.model.sections import rectangle as rectangle  # noqa: E402
+from linkax.model.shapes import Shape as Shape  # noqa: E402
 from linkax.model.terms import Term as Term  # noqa: E402
 from linkax.model.time_laws import PiecewiseLinear as PiecewiseLinear  # noqa: E402
 from linkax.model.time_laws import Spline as Spline  # noqa: E402

@@ -20,6 +20,7 @@ from linkax.model.forces.joint_limits import JointLimit
 from linkax.model.forces.point_forces import PointForce
 from linkax.model.joints.fixed import Fixed
 from linkax.model.joints.free import Free
+from linkax.model.shapes import Shape
 from linkax.xla.users_line import warn
 
 Pose = Float[np.ndarray, "4 4"]
@@ -49,6 +50,7 @@ class Draft:
     forces: list[Part] = dataclasses.field(default_factory=list)
     constraints: list[Part] = dataclasses.field(default_factory=list)
     poses: dict[str, Pose] = dataclasses.field(default_factory=lambda: {GROUND_NAME: np.eye(4)})
+    shapes: dict[str, list[Shape]] = dataclasses.field(default_factory=dict)
     starts: dict[str, Start] = dataclasses.field(default_factory=dict)
     left_out: list[LeftOut] = dataclasses.field(default_factory=list)
     missing: list[LeftOut] = dataclasses.field(default_factory=list)
@@ -97,6 +99,15 @@ class Draft:
         reason = f"of its principal moments {moments} kg m² the largest exceeds the sum of the others; reduced to that"
         self.leave_out(where, "inertia", reason)
         return turned(np.diag([moments[0], moments[1], most]), axes)
+
+    def shape(self, body: str, kind: Any, size: Any, at: Pose, mesh: Path | None = None, colour: Any = None) -> None:
+        """Add what a body is drawn as, from its pose on the body; what is not opaque at all is not seen.
+
+        **Raises:** `ValueError` for what is no shape.
+        """
+        shape = Shape(kind, size, at[:3, 3], at[:3, :3], mesh, colour)
+        if colour is None or colour[3]:
+            self.shapes.setdefault(body, []).append(shape)
 
     def joint(
         self, kind: type, name: str, parent: str, child: str, frame: Pose, where: Where, **arguments: Any
@@ -201,11 +212,17 @@ class Draft:
         self._hold(base)
         joints = {part.name: part for part in self.joints}
         forces = [self._completed(part, joints) for part in self.forces]
-        for part in (*self.bodies, *self.joints, *forces, *self.constraints):
+        bodies = [self._drawn(part) for part in self.bodies]
+        for part in (*bodies, *self.joints, *forces, *self.constraints):
             part.built({})
-        groups = tuple(self.bodies), tuple(self.joints), tuple(forces), tuple(self.constraints)
+        groups = tuple(bodies), tuple(self.joints), tuple(forces), tuple(self.constraints)
         self._warn()
         return Machine(self.name or self.path.stem, self.path, *groups, self.starts, tuple(self.left_out))
+
+    def _drawn(self, body):
+        """A body with its shapes."""
+        shapes = self.shapes.get(body.name)
+        return dataclasses.replace(body, arguments={**body.arguments, "shape": tuple(shapes)}) if shapes else body
 
     def _add(self, group, kind, arguments, where):
         taken = (id(group), arguments["name"])

@@ -49,6 +49,8 @@ def load(
     how stiff a stop is, the weight of the machine at its size presses it by 0.001 rad; dry friction is nearly viscous
     below 0.01 rad/s. Both are in `Machine.params`.
 
+    What bodies are drawn as is in `Machine.shapes`; meshes that are not there change no motion.
+
     XML is read without entities; other files are read only below the folder of the file.
 
     **Arguments:**
@@ -61,7 +63,8 @@ def load(
       SDF and USD, "fixed" in URDF and MJCF.
     - `closures`: for URDF, a YAML file of pairs of links that coincide: `closed_loop: [[a, b], ...]`, with
       `type: [3d, ...]` for points, or 6d.
-    - `folders`: further ones below which files may be read, such as those of meshes.
+    - `folders`: further ones below which files may be read. `package://robot/...` and `model://robot/...`, as addresses
+      of meshes, are in a folder `robot` there, or in one there that lies in `robot`.
     - `whole_angles`: take angles that are rounded multiples of 15 degrees, such as 1.5708 or 1.57 for π/2, as what they
       stand for. Axes that are meant to be parallel then are, and a planar loop is not locked by the digits of the file.
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from linkax.machines.parts import Part, meant
 from linkax.machines.xml import Where
 from linkax.model.mechanism import Mechanism
+from linkax.model.shapes import Shape
 from linkax.tables import Rows, Table, count, printed_as
 
 GROUPS = ("bodies", "joints", "forces", "constraints")
@@ -61,6 +62,7 @@ class Machine:
     - `starts`: states that the file names, {name: `positions` and `speeds` for `linkax.assemble`}.
     - `left_out`: what the file asks for and the machine does not have, with line and reason.
 
+    Its bodies know what they are drawn as, `shapes`, and so do the mechanisms that it makes, and their views.
     Coordinates are zero where the machine stands as the file draws it. A frame on a body is that of the file.
     """
 
@@ -83,6 +85,11 @@ class Machine:
         found = {group: {part.name: part.params for part in getattr(self, group)} for group in GROUPS}
         found = {group: {name: numbers for name, numbers in of.items() if numbers} for group, of in found.items()}
         return {group: of for group, of in found.items() if of}
+
+    @property
+    def shapes(self) -> dict[str, tuple[Shape, ...]]:
+        """What its bodies are drawn as, {body: shapes}, without those of which the file says nothing."""
+        return {part.name: part.arguments["shape"] for part in self.bodies if "shape" in part.arguments}
 
     def mechanism(self, params: Mapping[str, Any] | None = None) -> Mechanism:
         """Make the mechanism, a pure function of parameters.

@@ -8,6 +8,7 @@ import importlib
 import itertools
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from jaxtyping import Float
 from linkax.machines.draft import Draft, Pose
 from linkax.machines.machine import Start
 from linkax.machines.parts import Place
-from linkax.machines.poses import exact, from_quaternion, pose, relative, to_quaternion, turned
+from linkax.machines.poses import exact, from_quaternion, inverse, pose, relative, to_quaternion, turned
+from linkax.machines.visuals import find_mesh
 from linkax.machines.xml import MachineFileError, Node, Where, below, read_xml
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.constraints.constraint import Coupling
@@ -30,6 +32,8 @@ from linkax.model.joints.revolute import Revolute
 from linkax.model.joints.spherical import Spherical
 
 FILES = ("mesh", "texture", "hfield", "skin", "flex", "flexcomp", "model", "include")  # elements that name a file
+HIDDEN_GROUP = 3  # geoms of this group and later ones, MuJoCo's viewer hides, such as those of contact alone
+NO_COLOUR = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # of a geom that has none of its own
 DEEPEST = 20  # files that include each other
 SHORTEST = 1e-9  # apart from each other, two points of a pair of connects make an axis [m]
 
@@ -160,7 +164,7 @@ class _Compiled:
     def _elements(self, kind: str) -> dict[int, Any]:
         """The elements of a kind as the file has them, by their index in the model."""
         if kind not in self._found:
-            plural = {"body": "bodies", "equality": "equalities"}.get(kind, f"{kind}s")
+            plural = {"body": "bodies", "equality": "equalities", "mesh": "meshes"}.get(kind, f"{kind}s")
             self._found[kind] = {element.id: element for element in getattr(self.spec, plural)}
         return self._found[kind]
 
@@ -206,11 +210,53 @@ class _Compiled:
         for geom in range(model.ngeom if self._has("CONTACT") else 0):
             if model.geom_bodyid[geom] == index and model.geom_contype[geom] | model.geom_conaffinity[geom]:
                 draft.leave_out(self._where("geom")[geom], "contact", f"contact of body {name!r} with others")
+        for geom in range(model.ngeom):
+            if model.geom_bodyid[geom] == index and model.geom_group[geom] < HIDDEN_GROUP:
+                self._shape(geom, name)
         stations = [Place.at(parent, own), *(Place.at(between, np.eye(4)) for between in (*chain, name))]
         if not count:
             draft.joint_at(Fixed, f"{name}.fixed", stations[0], stations[-1], where)
         for step in range(count):
             self._joint(first + step, stations[step], stations[step + 1])
+
+    def _shape(self, index: int, body: str) -> None:
+        """A geom as it is seen, in the colour that MuJoCo's own viewer gives it; what is not kept of it is noted."""
+        model, where = self.model, self._where("geom")[index]
+        kind = self.mujoco.mjtGeom(int(model.geom_type[index])).name.removeprefix("mjGEOM_").lower()
+        at = pose(model.geom_pos[index], from_quaternion(model.geom_quat[index]))
+        colour, material = np.array(model.geom_rgba[index], dtype=float), int(model.geom_matid[index])
+        if np.all(colour == NO_COLOUR):
+            colour = np.array(model.mat_rgba[material], dtype=float) if material >= 0 else None
+        x, y, z = map(float, model.geom_size[index])
+        sizes = {
+            "sphere": [x], "capsule": [x, 2.0 * y], "cylinder": [x, 2.0 * y], "ellipsoid": [x, y, z],
+            "box": [2.0 * x, 2.0 * y, 2.0 * z],
+        }  # fmt: skip
+        try:
+            if kind == "mesh":
+                path, scale, in_geom = self._mesh(int(model.geom_dataid[index]), where)
+                self.draft.shape(body, kind, scale, at @ in_geom, path, colour)
+            elif kind in sizes:
+                self.draft.shape(body, kind, sizes[kind], at, None, colour)
+            else:
+                raise ValueError(f"a geom of type {kind!r} is not drawn")
+        except ValueError as error:
+            self.draft.leave_out(where, "geom", str(error), False)
+
+    def _mesh(self, index: int, where: Where) -> tuple[Path, np.ndarray, Pose]:
+        """The file of a mesh, its scale, and its pose in the geom, which MuJoCo has put at the centre of the mesh.
+
+        **Raises:** `ValueError` for a mesh that is in no file, and one that its scale shears.
+        """
+        model, element = self.model, self._elements("mesh")[index]
+        scale, back = np.array(model.mesh_scale[index]), from_quaternion(element.refquat).T
+        address = int(model.mesh_pathadr[index])
+        if address < 0 or (np.ptp(scale) and not np.allclose(back, np.eye(3))):
+            raise ValueError("its mesh is in no file, or turned before it is scaled, and not drawn")
+        file = Path(model.paths[address:].split(b"\0")[0].decode()).absolute()
+        path = find_mesh(self.draft, str(file), where)
+        centre = pose(model.mesh_pos[index], from_quaternion(model.mesh_quat[index]))
+        return path, scale, inverse(centre) @ pose(-scale * (back @ element.refpos), back)
 
     def _joint(self, index: int, parent: Place, child: Place) -> None:
         model, draft, kinds = self.model, self.draft, self.mujoco.mjtJoint

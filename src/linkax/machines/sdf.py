@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from linkax.machines.draft import Draft, Pose
 from linkax.machines.poses import from_angles, from_quaternion, pose, relative, turned
+from linkax.machines.visuals import read_visual
 from linkax.machines.xml import Node, read_numbers
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.constraints.constraint import Coupling
@@ -27,7 +28,7 @@ KINDS = {
 DEFAULT_GRAVITY = (0.0, 0.0, -9.8)
 NO_LIMIT = 1e16
 WORLD = "world"
-SEEN_ONLY = ("visual", "sensor", "light", "audio_sink", "audio_source", "projector", "battery", "particle_emitter")
+SEEN_ONLY = ("sensor", "light", "audio_sink", "audio_source", "projector", "battery", "particle_emitter")
 SETTINGS = (
     "pose",
     "inertial",
@@ -160,12 +161,30 @@ class _Model:
         for child in node:
             if child.tag == "collision":
                 draft.leave_out(child.where, "contact", "contact of this shape with others")
+            elif child.tag == "visual":
+                self._visual(node, child)
             elif child.tag in SEEN_ONLY:
                 draft.leave_out(child.where, child.tag, f"<{child.tag}> does not move anything", False)
             elif child.tag == "velocity_decay" and any(float(each.text or 0) for each in child):
                 draft.leave_out(child.where, "velocity_decay", "damping of the link in the air")
             elif child.tag not in SETTINGS:
                 draft.leave_out(child.where, child.tag, f"<{child.tag}> is not known", False)
+
+    def _visual(self, link: Node, node: Node) -> None:
+        """A shape that is only seen; what is not kept of it is noted."""
+        try:
+            given, at = node.find("pose"), self._raw_pose(node)
+            named = "" if given is None else given.attributes.get("relative_to", given.attributes.get("frame", ""))
+            if named:
+                at = relative(self.pose_of(named, node) @ at, self.pose_of(link.name))
+            material = node.find("material")
+            colours = [] if material is None else material.all("diffuse", "ambient")
+            colour = _colour(max(colours, key=lambda each: each.tag)) if colours else None
+            if colour is not None:
+                colour[3] *= 1.0 - node.number("transparency", 0.0)
+            read_visual(self.draft, self.prefix + link.name, node, at, colour)
+        except ValueError as error:
+            self.draft.leave_out(node.where, "visual", str(error), False)
 
     def _body(self, node: Node, end: str) -> str:
         """The link at one end of a joint, "world" for the ground; ends may be frames."""
@@ -303,6 +322,12 @@ class _Model:
 
 def _term(name, kind, index):
     return name if len(kind.speed_units) == 1 else (name, index)
+
+
+def _colour(node: Node) -> Float[np.ndarray, "4"]:
+    """Red, green, blue and opacity, which is 1 where it is not there."""
+    count = min(max(len(node.text.split()), 3), 4)
+    return np.append(read_numbers(node.text, count, node.where), 1.0)[:4]
 
 
 def _end(limit: Node, name: str) -> float | None:

@@ -13,6 +13,7 @@ import numpy as np
 from linkax.machines.draft import Draft, Pose
 from linkax.machines.parts import Place
 from linkax.machines.poses import from_angles, pose, turned
+from linkax.machines.visuals import read_visual
 from linkax.machines.xml import MachineFileError, Node, read_file
 from linkax.model.constraints.constraint import Coupling
 from linkax.model.joints.cylindrical import Cylindrical
@@ -30,7 +31,7 @@ KINDS = {
 }  # fmt: skip
 WITH_AXIS = (Revolute, Prismatic, Planar, Cylindrical)
 GRAVITY = (0.0, 0.0, -9.81)  # of which the format says nothing
-SEEN_ONLY = ("visual", "material", "gazebo", "transmission", "sensor", "mujoco", "safety_controller", "calibration")
+SEEN_ONLY = ("material", "gazebo", "transmission", "sensor", "mujoco", "safety_controller", "calibration")
 ZERO = (0.0, 0.0, 0.0)
 OF_YAML = {"3d": Spherical, "6d": Fixed}
 
@@ -49,6 +50,7 @@ class _Robot:
     def __init__(self, root: Node, draft: Draft) -> None:
         self.root, self.draft = root, draft
         self.links = {link.name: link for link in root.all("link")}
+        self.materials = {node.attributes.get("name", ""): node for node in root.all("material")}
         self.joints: dict[str, Node] = {}
         self.carrier: dict[str, tuple[str, str]] = {}  # of a link: its parent in the tree of joints, and the joint
 
@@ -75,7 +77,7 @@ class _Robot:
                 self._constraint(node)
             elif node.tag == "coupling":
                 self._coupling(node)
-            elif node.tag not in ("link", "joint"):
+            elif node.tag not in ("link", "joint", "material"):
                 known = node.tag in SEEN_ONLY
                 reason = f"<{node.tag}> does not move anything" if known else f"<{node.tag}> is not known"
                 draft.leave_out(node.where, node.tag, reason, not known)
@@ -119,8 +121,22 @@ class _Robot:
         for child in node:
             if child.tag == "collision":
                 self.draft.leave_out(child.where, "contact", "contact of this shape with others")
+            elif child.tag == "visual":
+                self._visual(node.name, child)
             elif child.tag != "inertial":
                 self.draft.leave_out(child.where, child.tag, f"<{child.tag}> does not move anything", False)
+
+    def _visual(self, link: str, node: Node) -> None:
+        """A shape that is only seen; what is not kept of it is noted."""
+        try:
+            material = node.find("material")
+            if material is not None and material.find("color") is None:
+                material = self.materials.get(material.attributes.get("name", ""))
+            colour = None if material is None else material.find("color")
+            rgba = None if colour is None else colour.numbers("rgba", 4)
+            read_visual(self.draft, link, node, self._origin(node.find("origin")), rgba)
+        except ValueError as error:
+            self.draft.leave_out(node.where, "visual", str(error), False)
 
     def _joint(self, node: Node, carries: bool) -> None:
         draft, where, kind = self.draft, node.where, node.attribute("type")

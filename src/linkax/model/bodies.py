@@ -2,7 +2,7 @@
 
 import abc
 import copy
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal, cast, get_args
 
 import equinox as eqx
@@ -15,6 +15,7 @@ from linkax.model.numbers import (
     Number,
     Vector,
     like,
+    listed,
     namespace,
     number,
     numbers_of,
@@ -25,12 +26,13 @@ from linkax.model.numbers import (
     value,
     zero_or_more,
 )
+from linkax.model.shapes import Shape, turned
 from linkax.straight_line.known import known_values
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
 GROUND_NAME = "ground"
-Shape = Literal["box", "ellipsoid"]
+OfInertia = Literal["box", "ellipsoid"]
 
 
 class Frame(eqx.Module):
@@ -99,7 +101,8 @@ class RigidBody(AbstractBody):
       number is the moment about z of a flat body, which is all that counts where it moves in the x-y plane; the other
       two are then half of it.
     - `frames`: named points `{"tip": [x, y, z]}` [m], for `body.at("tip")`.
-    - `shape`: how it is drawn: "box" or "ellipsoid", of this mass and inertia; None: by its joints and frames.
+    - `shape`: how it is drawn: "box" or "ellipsoid", of this mass and inertia; a list of `linkax.Shape`; None: by its
+      joints and frames.
 
     **Raises:** `ValueError` for a mass that is negative or not finite, and for an inertia tensor that no body has: one
     that is not symmetric, with a negative principal moment, or with one larger than the sum of the others.
@@ -110,7 +113,7 @@ class RigidBody(AbstractBody):
     center_of_mass: Float[Array, "3"]
     inertia: Float[Array, "3 3"]
     frames: dict[str, Float[Array, "3"]]
-    shape: Shape | None = eqx.field(static=True)
+    shape: OfInertia | tuple[Shape, ...] | None = eqx.field(static=True)
     drawn_at: Float[Array, "3"] | None
 
     def __init__(
@@ -121,7 +124,7 @@ class RigidBody(AbstractBody):
         inertia: Number | Matrix = (0.0, 0.0, 0.0),
         frames: Mapping[str, Vector] | None = None,
         *,
-        shape: Shape | None = None,
+        shape: OfInertia | Iterable[Shape] | None = None,
     ) -> None:
         self.name = body_name(name)
         self.mass = zero_or_more(mass, f"body {name!r}: mass [kg]")
@@ -134,7 +137,7 @@ class RigidBody(AbstractBody):
             self._label(label): number(offset, (3,), f"body {name!r}: frame {label!r} [m]")
             for label, offset in frames.items()
         }
-        self.shape = None if shape is None else one_of(shape, get_args(Shape), f"body {name!r}: shape")
+        self.shape = _drawn_as(shape, f"body {name!r}: shape")
         self.drawn_at = None
 
     def _label(self, label: Any) -> str:
@@ -190,6 +193,7 @@ class RigidBody(AbstractBody):
             placed["center_of_mass"] = turn @ self.center_of_mass
             placed["inertia"] = turn @ self.inertia @ turn.T
             placed["frames"] = {label: turn @ offset for label, offset in self.frames.items()}
+            placed["shape"] = turned(self.shape, turn) if isinstance(self.shape, tuple) else self.shape
         for name, entry in placed.items():
             object.__setattr__(found, name, entry)
         return found
@@ -205,6 +209,13 @@ class RigidBody(AbstractBody):
         if self.drawn_at is None:
             raise ValueError(f"{what} is {point!r}, but its place is not known; give it by body.placed(position)")
         return self.at(number(point, (3,), what) - self.drawn_at, rotation)
+
+
+def _drawn_as(shape: Any, what: str) -> OfInertia | tuple[Shape, ...] | None:
+    if isinstance(shape, str):
+        return one_of(shape, get_args(OfInertia), what)
+    remedy = 'give "box", "ellipsoid", or a list of lx.Shape'
+    return None if shape is None else tuple(listed(shape, Shape, what, remedy)) or None
 
 
 def body_name(name: Any) -> str:

@@ -231,7 +231,7 @@ def moving_frame(joint: AbstractJoint) -> Frame:
 
 def is_shaped(body: RigidBody) -> bool:
     """Whether a body is drawn as the box or ellipsoid that has its inertia."""
-    return body.shape is not None and bool(body.mass > 0.0)
+    return isinstance(body.shape, str) and bool(body.mass > 0.0)
 
 
 def is_concentrated(mechanism: Mechanism, body: RigidBody) -> bool:

@@ -30,6 +30,7 @@ from linkax.scenery.scenery import (
     principal_box,
     spans,
 )
+from linkax.view.solids import solids_of, space
 
 FLAT = 1e-6  # size of a singular value, relative to the largest, up to which marked points lie in a plane or line
 SYMBOLS = {
@@ -57,16 +58,17 @@ class Numbers:
         return np.concatenate(self.parts).astype("<f8").tobytes()
 
 
-def contents(scenery: Scenery, arrows: dict[str, tuple[Frame, np.ndarray]]) -> tuple[dict[str, Any], bytes]:
+def contents(scenery: Scenery, arrows: dict[str, tuple[Frame, np.ndarray]]) -> tuple[dict[str, Any], bytes, bytes]:
     """Describe bodies, joints, spans, traced points and arrows; positions in [m], ground axes.
 
     **Arguments:** `arrows`: {label: the frame where it begins, and its components at each time, (n_f, 3) [N]}.
 
-    **Returns:** the description, and its numbers, to which it refers by where they are.
+    **Returns:** the description, its numbers and those of meshes, to which it refers by where they are.
     """
     mechanism, numbers = scenery.mechanism, Numbers()
-    (low, high), up = scenery.space, upwards(mechanism)
     names = [*mechanism.topology.bodies, GROUND_NAME]
+    solids, meshes = solids_of(mechanism)
+    (low, high), up = space(scenery, solids, meshes), upwards(mechanism)
     place = lambda frame: [names.index(frame.body), _listed(frame.offset)]
     described = {
         "times": numbers.add(scenery.times),
@@ -82,7 +84,7 @@ def contents(scenery: Scenery, arrows: dict[str, tuple[Frame, np.ndarray]]) -> t
                 "colour": body_colour(index) if name != GROUND_NAME else "#777777",
                 "position": numbers.add(scenery.poses[name][0]),
                 "quaternion": numbers.add(quaternions(scenery.poses[name][1])),
-                "parts": _parts(scenery, name),
+                "parts": solids.get(name) or _parts(scenery, name),
             }
             for index, name in enumerate(names)
         ],
@@ -105,7 +107,7 @@ def contents(scenery: Scenery, arrows: dict[str, tuple[Frame, np.ndarray]]) -> t
             for label, (frame, values) in arrows.items()
         ],
     }
-    return described, numbers.bytes()
+    return described | {"meshes": meshes.described}, numbers.bytes(), meshes.bytes()
 
 
 def quaternions(axes: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:

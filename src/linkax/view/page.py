@@ -97,7 +97,7 @@ def _asked(saved, reactions) -> list[str]:
     return [saved.mechanism.joint(name).name for name in require_type(reactions, list | tuple, "reactions", remedy)]
 
 
-def _page(described: dict[str, Any], numbers: bytes) -> str:
+def _page(described: dict[str, Any], numbers: bytes, meshes: bytes) -> str:
     folder = files("linkax.view")
     text = lambda name: folder.joinpath(name).read_text(encoding="utf-8")
     filled = {
@@ -106,6 +106,7 @@ def _page(described: dict[str, Any], numbers: bytes) -> str:
         "THREE": _packed(text("three/three.min.js").encode()),
         "CONTENTS": _packed(json.dumps(described, allow_nan=False).encode()),
         "NUMBERS": _packed(numbers),
+        "MESHES": _packed(meshes),
     }
     page = text("page.html")
     for name, entry in filled.items():

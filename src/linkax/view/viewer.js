@@ -1,7 +1,7 @@
 "use strict";
 
 // Draws what contents.py describes. Returns {names, position, quaternion, pixel, time, playing, seek, play, pause}, for scripts and tests.
-function showMechanism(contents, numbers, T) {
+function showMechanism(contents, numbers, wholes, T) {
   const get = (id) => document.getElementById(id);
   const part = ([start, count]) => numbers.subarray(start, start + count);
   const vector = (entries, index = 0) => new T.Vector3(entries[3 * index], entries[3 * index + 1], entries[3 * index + 2]);
@@ -109,6 +109,26 @@ function showMechanism(contents, numbers, T) {
     },
   };
 
+  // Meshes of files, and solids of size one; a cylinder is along z.
+  const geometries = contents.meshes.map(({ low, size, points: [start, count], corners: [first, corners] }) => {
+    const step = size.map((length) => length / 65535);
+    const places = Float32Array.from(wholes.subarray(start, start + count), (whole, index) => low[index % 3] + step[index % 3] * whole);
+    const geometry = new T.BufferGeometry().setAttribute("position", new T.BufferAttribute(places, 3));
+    return geometry.setIndex(new T.BufferAttribute(wholes.slice(first, first + corners), 1));
+  });
+  const forms = {
+    cube: new T.BoxGeometry(1, 1, 1),
+    ball: new T.SphereGeometry(0.5, 40, 28),
+    cylinder: new T.CylinderGeometry(0.5, 0.5, 1, 48).rotateX(Math.PI / 2),
+  };
+  draw.solid = ({ form, mesh: which, matrix, colour: own, opacity }, colour, label, group) => {
+    const geometry = form === "mesh" ? geometries[which] : forms[form];
+    const solid = mesh(geometry, own || colour, label, group, opacity);
+    solid.material.flatShading = form === "mesh"; // such a mesh has no normals
+    solid.matrixAutoUpdate = false;
+    solid.matrix.set(...matrix.flat());
+  };
+
   function turn(object, axes) {
     object.setRotationFromMatrix(new T.Matrix4().makeBasis(...axes.map((axis) => vector(axis))));
     return object;
@@ -141,6 +161,7 @@ function showMechanism(contents, numbers, T) {
     if (!kind) continue;
     const group = turn(new T.Group(), axes);
     group.position.copy(vector(at[1]));
+    group.scale.setScalar(contents.bodies[at[0]].parts.some((shape) => shape.kind === "solid") ? 0.6 : 1);
     bodies[at[0]].group.add(group);
     symbols[kind]().forEach((geometry) => edged(geometry, slides ? colours[at[0]] : PALE, label, group));
     for (const [, offset] of stands ? ground : []) {

@@ -128,7 +128,8 @@ class Kinematics(eqx.Module):
         """Show the motion in three dimensions, in any browser or in a notebook.
 
         The page needs no network. It turns, zooms and plays; names show where the pointer is. Bodies are drawn
-        through their joints and named frames, or by their shape, see `linkax.RigidBody`.
+        as their shapes, see `linkax.RigidBody`, or through their joints and named frames. A warning tells which meshes
+        cannot be read.
 
         **Arguments:**
 
