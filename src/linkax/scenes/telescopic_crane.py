@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import linkax as lx
 from linkax.model.bodies import BodyOrFrame
 from linkax.model.numbers import Number
+from linkax.scenes.course import Course
 from linkax.scenes.scene import Parameters, described
 from linkax.xla.arrays import Scalar
 
@@ -31,18 +32,6 @@ END = 1.0  # of the extension rope and its sheave, from the ends of the sections
 SHEAVE = 0.2  # of the same, above the axes of the sections [m]
 STROKES = {"luffing": (2.0, 3.2), "telescoping": (0.0, 8.0)}  # where a cylinder is closed, and its stroke [m]
 STEEL = {"poissons_ratio": 0.3, "density": 7850.0}
-
-
-class Course(eqx.Module):
-    """A smooth change from one value to another in a time [s], by a polynomial of fifth degree."""
-
-    begin: Scalar
-    end: Scalar
-    duration: Scalar
-
-    def __call__(self, t: Number) -> Scalar:
-        s = jnp.clip(t / self.duration, 0.0, 1.0)
-        return self.begin + (self.end - self.begin) * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 class Reach(eqx.Module):
