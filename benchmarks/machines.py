@@ -1,9 +1,13 @@
-"""Machines from files: what is found in them, and their motion beside other tools that read the same file.
+"""Machines from files and ready-made ones: what is found in them, and their motion beside other tools.
 
-`found`: of each file loops, degrees of freedom, redundant rows, and how far open `linkax.assemble` leaves loops,
+Of files, `found`: of each loops, degrees of freedom, redundant rows, and how far open `linkax.assemble` leaves loops,
 relative to their length. `pinocchio`: accelerations against `constraintDynamics`, a proximal solve with hard loops, of
 a model with the same numbers, at twenty states of a motion. `mujoco`: how far a motion is from MuJoCo's, whose
 equalities are soft, as they are stiffened with shorter steps.
+
+Of the scenes of machines, `pins`: of an excavator and a Delta robot, let go without motors, how far pins that close
+loops are apart at most [m] here, and in MuJoCo as it comes and stiffened; and the largest force at each pin [N].
+`hoberman`: rings of up to 240 struts, their rank, and the time of one evaluation of their equations of motion [µs].
 
 `python -m benchmarks.machines [PART ...]` prints one JSON object.
 """
@@ -19,6 +23,8 @@ import mujoco
 import numpy as np
 
 import linkax as lx
+from benchmarks.evaluation import cost
+from linkax.scenes import SCENES
 
 FILES = Path(__file__).parents[1] / "tests" / "data" / "machines"
 IGNORED = ("contact", "limit", "friction", "actuator", "tendon", "inertia", "joint")
@@ -31,6 +37,9 @@ OF_HINGES = (("robotiq_2f85_v2.xml", None), ("xarm7_gripper.xml", None), ("cassi
 STATES = 20
 STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1.25e-4)
 STIFF = 2.0  # steps in which MuJoCo's gaps decay
+FALL = 0.3  # seconds
+SOFTNESS = {"default": None, **{f"stiffened, step {step}": step for step in (1e-3, 1e-4)}}
+RINGS = ((6, 1), (12, 1), (12, 2), (24, 2), (24, 3), (24, 5))  # pairs in a ring, rings
 
 
 def load(name, *ignore, base=None):
@@ -163,8 +172,7 @@ def stiffened(spec, step, times, machine):
     spec.option.timestep, spec.option.tolerance, spec.option.iterations = step, 1e-14, 200
     for flag in ("CONTACT", "LIMIT", "FRICTIONLOSS", "ACTUATION"):
         spec.option.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
-    for equality in spec.equalities:
-        equality.solref, equality.solimp = [STIFF * step, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
+    stiffen(spec.equalities, step)
     model = spec.compile()
     data = mujoco.MjData(model)
     bodies = [name for name in (part.name for part in machine.bodies) if mujoco.mj_name2id(model, 1, name) >= 0]
@@ -179,10 +187,68 @@ def stiffened(spec, step, times, machine):
     return {name: np.array(place) for name, place in places.items()}
 
 
+def stiffen(equalities, step):
+    """Let gaps of MuJoCo's equalities decay in a few steps."""
+    for equality in equalities:
+        equality.solref, equality.solimp = [STIFF * step, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
+
+
+def pins(name):
+    """How far pins are open in a fall, here and in MuJoCo, and what they carry."""
+    scene = SCENES[name]
+    parameters = scene.settings("held")
+    held = scene.mechanism(parameters)
+    mechanism = lx.Mechanism(held.bodies, held.joints, held.forces)
+    start = scene.initial(mechanism, parameters)
+    solution = lx.simulate(mechanism, start, t1=FALL)
+    forces = {name: float(np.linalg.norm(found.force, axis=-1).max()) for name, found in solution.reactions().items()}
+    text = lx.to_mjcf(mechanism, state=start)
+    theirs = {name: open_in_mujoco(text, step) for name, step in SOFTNESS.items()}
+    return {"linkax": float(solution.worst_violation().position), "mujoco": theirs, "force": forces}
+
+
+def open_in_mujoco(text, step):
+    """The largest distance [m] between two points that MuJoCo connects; None: its own step and softness."""
+    spec = mujoco.MjSpec.from_string(text)
+    if step is not None:
+        spec.option.timestep, spec.option.tolerance, spec.option.iterations = step, 1e-14, 200
+        stiffen(spec.equalities, step)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    worst = 0.0
+    while data.time < FALL:
+        mujoco.mj_step(model, data)
+        gaps = data.efc_pos[: data.ne].reshape(-1, 3)
+        worst = max(worst, np.linalg.norm(gaps, axis=1).max())
+    return worst
+
+
+def rings(pairs, count):
+    """Rank and cost of a ring of scissors, or several, as drawn."""
+    changes = {"pairs": pairs, "rings": count, "angle": 1.3 * np.pi / pairs, "motor": 2}
+    mechanism = SCENES["hoberman"].mechanism(SCENES["hoberman"].settings(changes=changes))
+    topology = mechanism.topology
+    state = lx.State(np.zeros(topology.num_coordinates), np.zeros(topology.num_speeds), topology)
+    mobility, price = lx.mobility(mechanism, state), cost(mechanism, state)
+    return {
+        "struts": 2 * pairs * count,
+        "bodies": topology.num_bodies,
+        "joints": topology.num_bodies + topology.num_cuts,
+        "rank": int(mobility.rank),
+        "redundant_rows": int(mobility.num_redundant),
+        "degrees_of_freedom": int(mobility.degrees_of_freedom),
+        "us": price["us"],
+        "compile_s": price["compile_s"],
+    }
+
+
 PARTS = {
     "found": lambda: {name: found(name) for name in ALL},
     "pinocchio": lambda: {name: beside_pinocchio(name, base) for name, base in OF_HINGES},
     "mujoco": lambda: {name: beside_mujoco(name) for name in GRIPPERS},
+    "pins": lambda: {name: pins(name) for name in ("excavator", "delta")},
+    "hoberman": lambda: [rings(*counts) for counts in RINGS],
 }
 
 
