@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 from linkax.machines.xml import read_file
 from linkax.xla.users_line import warn
 
-FORMATS = ("stl", "obj", "dae")  # DAE where trimesh reads it, which takes pycollada
+FORMATS = ("stl", "obj", "dae")
+MORE = {"dae": ", or pip install pycollada networkx"}  # what trimesh needs for a format
 MOST_TRIANGLES = 50_000  # of a mesh in a page; of larger ones, points that are near to each other become one
 FINEST = 1024  # places along the longest side of a mesh that is made smaller
 
@@ -44,7 +45,7 @@ def _read(path: Path) -> Mesh:
         raise ValueError("trimesh reads it; pip install 'linkax[files]'") from error
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS or kind not in trimesh.available_formats():
-        raise ValueError(f"a mesh of format {kind!r} is not read; convert it to STL or OBJ")
+        raise ValueError(f"a mesh of format {kind!r} is not read; convert it to STL or OBJ{MORE.get(kind, '')}")
     read = trimesh.load_mesh(io.BytesIO(read_file(path)), file_type=kind)  # without the path no other file is read
     points, triangles = np.asarray(read.vertices, float), np.asarray(read.faces, int)
     if not len(triangles) or not np.all(np.isfinite(points)):
