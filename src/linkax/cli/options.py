@@ -32,12 +32,14 @@ class RunOptions:
     """The run that a command line asks for.
 
     - `scene`, `variant`, `parameters`: see `linkax.scenes.scene.Scene`.
+    - `is_of_file`: whether it is that of a file of a machine.
     - `t1`: end time [s]. `accuracy`, `solver`: see `linkax.simulate`.
     - `points`: {name: (body, frame of the body or None for its centre of mass)}.
     - `described`: all of it as JSON holds it.
     """
 
     scene: Scene
+    is_of_file: bool
     variant: str
     parameters: dict[str, object]
     t1: float
@@ -50,7 +52,7 @@ class RunOptions:
     def __init__(self, arguments: argparse.Namespace) -> None:
         if arguments.solver == "rk4" and arguments.dt is None:
             raise ValueError("--solver rk4 estimates no error; give its steps by --dt")
-        self.scene = asked_scene(arguments)
+        self.scene, self.is_of_file = asked_scene(arguments), is_file(arguments.scene)
         self.variant = self.scene.default_variant if arguments.variant is None else arguments.variant
         self.parameters = self.scene.settings(self.variant, _changes(arguments.changes))
         self.t1 = self.scene.duration(self.variant) if arguments.t1 is None else arguments.t1
@@ -73,7 +75,7 @@ class RunOptions:
             "solver": next(name for name, kind in SOLVERS.items() if type(self.solver) is kind),
             "parameters": {name: float(cast(SupportsFloat, entry)) for name, entry in self._told().items()},
         }
-        if is_file(arguments.scene):
+        if self.is_of_file:
             self.described |= {
                 "file": arguments.scene,
                 "hold": _changes(arguments.hold, "0"),
@@ -82,7 +84,7 @@ class RunOptions:
 
     def _told(self):
         """The parameters of a scene; of a file, which may have hundreds, those that are changed."""
-        known = {} if self.scene.name in SCENES else self.scene.parameters
+        known = self.scene.parameters if self.is_of_file else {}
         return {name: entry for name, entry in self.parameters.items() if known.get(name) != entry}
 
     def initial(self, mechanism: lx.Mechanism) -> lx.State:

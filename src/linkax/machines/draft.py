@@ -211,7 +211,8 @@ class Draft:
             raise MachineFileError(f"{self.path.name} has no body; give a file of a machine")
         self._hold(base)
         joints = {part.name: part for part in self.joints}
-        forces = [self._completed(part, joints) for part in self.forces]
+        size = self.size
+        forces = [self._completed(part, joints, size) for part in self.forces]
         bodies = [self._drawn(part) for part in self.bodies]
         for part in (*bodies, *self.joints, *forces, *self.constraints):
             part.built({})
@@ -237,7 +238,8 @@ class Draft:
     def _hold(self, base):
         """Join to the ground the first body of each part that nothing holds there."""
         carrying = [joint for joint in self.joints if joint.kind.can_carry]
-        reached = _connected(carrying, GROUND_NAME)
+        neighbours = _neighbours(carrying)
+        reached = _connected(neighbours, GROUND_NAME)
         for body in self.bodies:
             if body.name in reached:
                 continue
@@ -246,7 +248,7 @@ class Draft:
             self.joints.insert(
                 0, Part(kind, {"name": f"{body.name}.{word}", "parent": ground(pose), "child": child}, body.where)
             )
-            reached |= _connected(carrying, body.name)
+            reached |= _connected(neighbours, body.name)
 
     @property
     def size(self) -> float:
@@ -254,19 +256,19 @@ class Draft:
         origins = [self.poses[place.body][:3] @ [*place.offset, 1.0] for joint in self.joints for place in _ends(joint)]
         return float(np.ptp(origins, axis=0).max()) or 1.0 if origins else 1.0
 
-    def _completed(self, part, joints):
+    def _completed(self, part, joints, size):
         """A stop, or dry friction, with the numbers that the file does not give."""
         if part.kind not in (JointLimit, JointFriction):
             return part
         along = part.arguments["joint"]
         name, index = along if isinstance(along, tuple) else (along, 0)
-        unit = self.size if joints[name].kind.speed_units[index] == "m" else 1.0
+        unit = size if joints[name].kind.speed_units[index] == "m" else 1.0
         arguments = dict(part.arguments)
         if part.kind is JointFriction:
             return dataclasses.replace(part, arguments=arguments | {"scale": FRICTION_SPEED * unit})
         law = dict(arguments["law"].arguments)
         if law["stiffness"] is None:
-            weight = 9.81 * self.size * sum(body.arguments["mass"] for body in self.bodies) or 1.0
+            weight = 9.81 * size * sum(body.arguments["mass"] for body in self.bodies) or 1.0
             law["stiffness"] = weight / STOP_DEPTH / unit**2
         if law.pop("damping") is None:
             law |= {"restitution": STOP_RESTITUTION, "impact_speed": unit}
@@ -305,13 +307,18 @@ def _ends(joint: Part) -> Sequence[Place]:
     return joint.arguments["parent"], joint.arguments["child"]
 
 
-def _connected(joints: Iterable[Part], body: str) -> set[str]:
-    """The names of all bodies that joints connect with one."""
-    neighbours: dict[str, set[str]] = {}
+def _neighbours(joints: Iterable[Part]) -> dict[str, set[str]]:
+    """The names of the bodies that joints connect with each."""
+    found: dict[str, set[str]] = {}
     for joint in joints:
         first, second = (place.body for place in _ends(joint))
-        neighbours.setdefault(first, set()).add(second)
-        neighbours.setdefault(second, set()).add(first)
+        found.setdefault(first, set()).add(second)
+        found.setdefault(second, set()).add(first)
+    return found
+
+
+def _connected(neighbours: dict[str, set[str]], body: str) -> set[str]:
+    """The names of all bodies on a way from neighbour to neighbour, from one of them."""
     found, open_ones = {body}, [body]
     while open_ones:
         fresh = neighbours.get(open_ones.pop(), set()) - found

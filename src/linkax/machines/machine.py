@@ -102,7 +102,7 @@ class Machine:
         for group, of in params.items():
             if group not in GROUPS:
                 raise ValueError(f"params has {group!r}{meant(group, GROUPS)}; known: {', '.join(GROUPS)}")
-            names = [part.name for part in getattr(self, group)]
+            names = {part.name for part in getattr(self, group)}
             for name in of:
                 if name not in names:
                     raise ValueError(

@@ -152,8 +152,8 @@ class _Compiled:
             self._tendon(tendon)
         for actuator in range(model.nu if self._has("ACTUATION") else 0):
             self._actuator(actuator)
-        for where in self._where("sensor"):
-            draft.leave_out(where, "sensor", "a sensor does not move anything", False)
+        for sensor in sorted(self._elements("sensor")):
+            draft.leave_out(self._where("sensor", sensor), "sensor", "a sensor does not move anything", False)
         for key in range(model.nkey):
             self._start(key)
 
@@ -180,14 +180,15 @@ class _Compiled:
             taken.add(found[-1])
         return found
 
-    def _where(self, kind: str) -> list[Where]:
-        found = sorted(self._elements(kind).items())
-        return [Where(self.draft.path, _line(each), kind, each.name) for _, each in found]
+    def _where(self, kind: str, index: int) -> Where:
+        """The place of an element by its index in the model."""
+        element = self._elements(kind)[index]
+        return Where(self.draft.path, _line(element), kind, element.name)
 
     def _body(self, index: int) -> None:
         """A body, and massless ones between its joints where it has several."""
         model, draft = self.model, self.draft
-        where = self._where("body")[index]
+        where = self._where("body", index)
         name, parent = self.body_names[index], self.body_names[model.body_parentid[index]]
         own = pose(model.body_pos[index], from_quaternion(model.body_quat[index]))
         drawn = draft.poses[parent] @ own
@@ -207,11 +208,11 @@ class _Compiled:
             draft.carry(name, at, -mass * float(model.body_gravcomp[index]) * self.gravity, where)
         if model.body_mocapid[index] >= 0:
             draft.leave_out(where, "mocap", "the body is moved by motion capture; it stays as drawn")
-        for geom in range(model.ngeom if self._has("CONTACT") else 0):
-            if model.geom_bodyid[geom] == index and model.geom_contype[geom] | model.geom_conaffinity[geom]:
-                draft.leave_out(self._where("geom")[geom], "contact", f"contact of body {name!r} with others")
-        for geom in range(model.ngeom):
-            if model.geom_bodyid[geom] == index and model.geom_group[geom] < HIDDEN_GROUP:
+        begin = int(model.body_geomadr[index])
+        for geom in range(begin, begin + int(model.body_geomnum[index])):
+            if self._has("CONTACT") and model.geom_contype[geom] | model.geom_conaffinity[geom]:
+                draft.leave_out(self._where("geom", geom), "contact", f"contact of body {name!r} with others")
+            if model.geom_group[geom] < HIDDEN_GROUP:
                 self._shape(geom, name)
         stations = [Place.at(parent, own), *(Place.at(between, np.eye(4)) for between in (*chain, name))]
         if not count:
@@ -221,7 +222,7 @@ class _Compiled:
 
     def _shape(self, index: int, body: str) -> None:
         """A geom as it is seen, in the colour that MuJoCo's own viewer gives it; what is not kept of it is noted."""
-        model, where = self.model, self._where("geom")[index]
+        model, where = self.model, self._where("geom", index)
         kind = self.mujoco.mjtGeom(int(model.geom_type[index])).name.removeprefix("mjGEOM_").lower()
         at = pose(model.geom_pos[index], from_quaternion(model.geom_quat[index]))
         colour, material = np.array(model.geom_rgba[index], dtype=float), int(model.geom_matid[index])
@@ -260,7 +261,7 @@ class _Compiled:
 
     def _joint(self, index: int, parent: Place, child: Place) -> None:
         model, draft, kinds = self.model, self.draft, self.mujoco.mjtJoint
-        where, name, kind = self._where("joint")[index], self.joint_names[index], kinds(int(model.jnt_type[index]))
+        where, name, kind = self._where("joint", index), self.joint_names[index], kinds(int(model.jnt_type[index]))
         dof = int(model.jnt_dofadr[index])
         if kind == kinds.mjJNT_FREE:
             draft.joint_at(Free, name, parent, child, where)
@@ -319,7 +320,7 @@ class _Compiled:
         model, kinds = self.model, self.mujoco.mjtEq
         names, places = (
             self._names("equality", [self._between(index) for index in range(model.neq)]),
-            self._where("equality"),
+            [self._where("equality", index) for index in range(model.neq)],
         )
         pairs = defaultdict[tuple[str, str], list[tuple[int, Place, Place]]](list)
         for index, (name, where) in enumerate(zip(names, places, strict=True)):
@@ -410,7 +411,7 @@ class _Compiled:
 
     def _tendon(self, index: int) -> None:
         """Spring and damper of a fixed tendon."""
-        model, where = self.model, self._where("tendon")[index]
+        model, where = self.model, self._where("tendon", index)
         stiffness = float(model.tendon_stiffness[index]) * self._has("SPRING")
         damping = float(model.tendon_damping[index]) * self._has("DAMPER")
         if model.tendon_limited[index] or model.tendon_frictionloss[index] or model.tendon_armature[index]:
@@ -430,7 +431,7 @@ class _Compiled:
     def _actuator(self, index: int) -> None:
         """A force along a joint or a fixed tendon, affine in control, length and rate."""
         model, kinds = self.model, self.mujoco
-        where, name = self._where("actuator")[index], self._names("actuator")[index]
+        where, name = self._where("actuator", index), self._names("actuator")[index]
         if self.draft.ignores("actuator", where, "the actuator"):
             return
         transmission, target = kinds.mjtTrn(int(model.actuator_trntype[index])), int(model.actuator_trnid[index][0])
@@ -460,13 +461,10 @@ class _Compiled:
             factor * float(model.qpos0[model.jnt_qposadr[self.joint_names.index(joint)]])
             for joint, factor in terms.items()
         )
-        gain, bias = (np.array(of[index][:3]) for of in (model.actuator_gainprm, model.actuator_biasprm))
-        gain, bias = (
-            np.zeros(3) if none else np.array([of[0] + of[1] * drawn, of[1], of[2]])
-            for of, none in ((gain, False), (bias, bias_type == kinds.mjtBias.mjBIAS_NONE))
-        )
-        if gain_type == kinds.mjtGain.mjGAIN_FIXED:
-            gain = float(model.actuator_gainprm[index][0])
+        from_drawn = lambda prm: np.array([prm[0] + prm[1] * drawn, prm[1], prm[2]])
+        given, bias_given = model.actuator_gainprm[index], model.actuator_biasprm[index]
+        gain = float(given[0]) if gain_type == kinds.mjtGain.mjGAIN_FIXED else from_drawn(given)
+        bias = np.zeros(3) if bias_type == kinds.mjtBias.mjBIAS_NONE else from_drawn(bias_given)
         arguments: dict[str, Any] = {"transmission": terms, "control": 0.0, "gain": gain, "bias": bias}
         if model.actuator_forcelimited[index]:
             arguments["force_range"] = np.array(model.actuator_forcerange[index])
@@ -500,7 +498,7 @@ class _Compiled:
         name = self._names("key")[index]
         self.draft.starts[name] = Start(positions, speeds)
         if np.any(model.key_ctrl[index]):
-            self.draft.leave_out(self._where("key")[index], "key", "controls of a keyframe; give them as params", False)
+            self.draft.leave_out(self._where("key", index), "key", "controls of a keyframe; give them as params", False)
 
     def _free_frame(self, joint: int) -> Pose:
         """The parent's frame of a free joint in the world, where the file draws its body."""
