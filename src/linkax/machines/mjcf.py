@@ -4,7 +4,6 @@ What the elements mean: https://mujoco.readthedocs.io/en/stable/XMLreference.htm
 includes and inertias from shapes; what it compiles is read here.
 """
 
-import importlib
 import itertools
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -19,7 +18,7 @@ from linkax.machines.machine import Start
 from linkax.machines.parts import Place
 from linkax.machines.poses import exact, from_quaternion, inverse, pose, relative, to_quaternion, turned
 from linkax.machines.visuals import find_mesh
-from linkax.machines.xml import MachineFileError, Node, Where, below, read_xml
+from linkax.machines.xml import MachineFileError, Node, Where, below, library, read_xml
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.constraints.constraint import Coupling
 from linkax.model.constraints.polynomial_coupling import PolynomialCoupling
@@ -43,10 +42,7 @@ def read_mjcf(root: Node, draft: Draft) -> None:
 
     **Raises:** `MachineFileError` for what MuJoCo does not read, with its message, and without MuJoCo.
     """
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError as error:
-        raise MachineFileError(f"{draft.path.name} is MJCF, which MuJoCo reads; pip install 'linkax[files]'") from error
+    mujoco = library("mujoco", draft.path, "MJCF, which MuJoCo")
     missing = _files(root, draft)
     try:
         spec = mujoco.MjSpec.from_file(str(draft.path))

@@ -14,7 +14,7 @@ from linkax.machines.draft import Draft, Pose
 from linkax.machines.parts import Place
 from linkax.machines.poses import from_angles, pose, turned
 from linkax.machines.visuals import read_visual
-from linkax.machines.xml import MachineFileError, Node, read_file
+from linkax.machines.xml import MachineFileError, Node, library, read_file
 from linkax.model.constraints.constraint import Coupling
 from linkax.model.joints.cylindrical import Cylindrical
 from linkax.model.joints.fixed import Fixed
@@ -230,10 +230,7 @@ def close_by_yaml(draft: Draft, path: Path) -> None:
 
     **Raises:** `MachineFileError` without PyYAML, and for a file that says it otherwise.
     """
-    try:
-        import yaml
-    except ImportError as error:
-        raise MachineFileError(f"{path.name} is YAML, which PyYAML reads; pip install 'linkax[files]'") from error
+    yaml = library("yaml", path, "YAML, which PyYAML")
     try:
         given = yaml.safe_load(read_file(path))
     except (yaml.YAMLError, RecursionError) as error:

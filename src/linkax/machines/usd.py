@@ -4,7 +4,6 @@ What the schemas mean: https://openusd.org/release/api/usd_physics_page_front.ht
 rad; scale goes into lengths. Attributes are read at the earliest time.
 """
 
-import importlib
 import os
 import re
 import zipfile
@@ -20,7 +19,7 @@ from linkax.machines.draft import Draft, Pose
 from linkax.machines.machine import Start
 from linkax.machines.parts import Place
 from linkax.machines.poses import exact, from_quaternion, pose, relative, to_quaternion, turned
-from linkax.machines.xml import DEEPEST, MachineFileError, Where, below, read_file
+from linkax.machines.xml import DEEPEST, MachineFileError, Where, below, library, read_file
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.forces.affine_actuator import AffineActuator
 from linkax.model.joints.cylindrical import Cylindrical
@@ -63,10 +62,7 @@ def read_usd(draft: Draft) -> None:
     """
     path = draft.path
     data = read_file(path)
-    try:
-        pxr: Any = {name: importlib.import_module(f"pxr.{name}") for name in MODULES}
-    except ImportError as error:
-        raise MachineFileError(f"{path.name} is USD, which usd-core reads; pip install 'linkax[files]'") from error
+    pxr = {name: library(f"pxr.{name}", path, "USD, which usd-core") for name in MODULES}
     with pxr["Tf"].DiagnosticTrap() as told:
         try:
             _check_files(pxr["Sdf"], path, draft)

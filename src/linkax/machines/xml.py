@@ -1,10 +1,11 @@
 """XML with the line of each element, read without entities, and no larger than a machine is."""
 
+import importlib
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
@@ -196,6 +197,17 @@ def read_xml(path: Path) -> Node:
             raise
         raise refuse(f"cannot be read, {error}") from error
     return roots[0]
+
+
+def library(module: str, path: Path, reads: str) -> Any:
+    """Import the library that reads a format.
+
+    **Raises:** `MachineFileError` that says how to install it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MachineFileError(f"{path.name} is {reads} reads; pip install 'linkax[files]'") from error
 
 
 def below(folder: Path, name: str, roots: Sequence[Path], fail: Callable[[str], MachineFileError]) -> Path:
