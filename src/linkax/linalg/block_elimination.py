@@ -63,12 +63,12 @@ class BlockInverse(eqx.Module):
         """Solve for (a, λ)."""
         plan, kept = self.plan, self.last.shape[0]
         added = plan.interior_table.shape[1]
-        own = jnp.concatenate([_read(self.scales * f, plan.interior_table), _read(gamma, plan.row_table)], axis=1)
-        nothing = jnp.zeros(2 * kept, own.dtype)
+        own = _read(self.scales * f, plan.interior_table), _read(gamma, plan.row_table)
+        nothing = jnp.zeros(2 * kept, f.dtype)
 
         def forwards(passed, front):
-            matrix, own = front
-            known = jnp.concatenate([passed, own])
+            matrix, (f, gamma) = front
+            known = jnp.concatenate([f, passed, gamma])
             return matrix @ known, known
 
         passed, known = lax.scan(forwards, nothing, (self.forwards, own))
@@ -79,7 +79,7 @@ class BlockInverse(eqx.Module):
             found = matrix @ jnp.concatenate([returned, known])
             return found[: 2 * kept], found[2 * kept :]
 
-        returned = jnp.concatenate([along, jnp.zeros(kept, along.dtype)])
+        returned = jnp.concatenate([jnp.zeros(kept, along.dtype), along])
         _, found = lax.scan(backwards, returned, (self.backwards, known), reverse=True)
         a = self.scales * _gathered(found[:, :added], plan.interior_table, f.shape[0])
         return a, _gathered(found[:, added:], plan.row_table, gamma.shape[0])
@@ -217,29 +217,27 @@ class _Here(NamedTuple):
         solved = jnp.where(stays[:, None] & stays[None, :], root.T @ root, 0.0)
         to_stay = solved @ metric  # A H: what staying directions do when others move
 
-        # Columns of the identity: the load and the decided speeds passed on, f, γ.
-        known = 2 * kept + added + rows
-        columns = jnp.eye(known, dtype=dtype)
-        load, decided, f, gamma = jnp.split(columns, [kept, 2 * kept, 2 * kept + added])
-        load = basis.T @ jnp.concatenate([load, f - blocks.coupling.T @ decided])
-        along_normal = asked @ (gamma - of_kept @ decided)
-        remaining = load - metric[:, width - count :] @ along_normal
+        # Each by what it depends on, in columns: f, the load and the decided speeds passed on, γ. Loads need no γ, the
+        # normal space neither f nor loads.
+        of_normal, ahead = metric[:, width - count :], ((0, 0), (added + kept, 0))
+        of_loads = jnp.concatenate([basis[kept:].T, basis[:kept].T, -basis[kept:].T @ blocks.coupling.T], axis=1)
+        normally = jnp.concatenate([-asked @ of_kept, asked], axis=1)
+        remaining = jnp.pad(of_loads, ((0, 0), (0, rows))) - jnp.pad(of_normal @ normally, ahead)
         staying = solved @ remaining
         on = jnp.where(passes[:, None], remaining - metric @ staying, 0.0)[:kept]
-        decided_on = onward[:, :kept] @ decided + moves[:, width - count :] @ along_normal
-        forwards = jnp.concatenate([on, decided_on])
+        asks = jnp.pad(onward[:, :kept], ((0, 0), (0, rows))) + moves[:, width - count :] @ normally
+        forwards = jnp.concatenate([on, jnp.pad(asks, ahead)])
 
-        # The same, and before them the motion along directions passed on and the force on the speeds passed on.
-        behind = lambda columns: jnp.pad(columns, ((0, 0), (2 * kept, 0)))
-        onwards = jnp.where(passes[:, None], jnp.eye(width, 2 * kept + known, dtype=dtype), 0.0)
-        normally = jnp.pad(along_normal, ((width - count, 0), (0, 0)))
-        motion = onwards - to_stay @ onwards + behind(staying + normally)
-        force = jnp.eye(kept, 2 * kept + known, kept, dtype=dtype)
-        held = (metric @ motion - behind(load))[width - count :] - moves[:, width - count :].T @ force
-        multipliers = asked.T @ held
-        y = basis @ motion
-        back = onward[:, :kept].T @ force + of_kept.T @ multipliers - blocks.coupling @ y[kept:]
-        backwards = jnp.concatenate([y[:kept], back, y[kept:], multipliers])
+        # The same, and before that the force on the speeds passed on, and the motion along directions passed on.
+        onwards = jnp.where(passes[:kept], jnp.eye(width, kept, dtype=dtype) - to_stay[:, :kept], 0.0)
+        along_normal = jnp.pad(normally, ((width - count, 0), (added + kept, 0)))
+        motion = jnp.concatenate([onwards, staying + along_normal], axis=1)
+        held = of_normal.T @ motion - jnp.pad(of_loads[width - count :], ((0, 0), (kept, rows)))
+        multipliers = asked.T @ jnp.concatenate([-moves[:, width - count :].T, held], axis=1)
+        y = jnp.pad(basis @ motion, ((0, 0), (kept, 0)))
+        others = ((0, 0), (0, y.shape[1] - kept))
+        back = jnp.pad(onward[:, :kept].T, others) + of_kept.T @ multipliers - blocks.coupling @ y[kept:]
+        backwards = jnp.concatenate([back, y, multipliers])
 
         condensed = metric - metric @ to_stay
         both = passes[:, None] & passes[None, :]
