@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from linkax.linalg.elimination_plan import PER_FRONT, EliminationPlan, plan_elimination
+from linkax.linalg.elimination_plan import PER_FRONT, EliminationPlan, plan_elimination, work_at_once
 from linkax.model.topology import Topology
 from linkax.xla.arrays import Array
 
@@ -43,7 +43,7 @@ class Structure(NamedTuple):
 def structure_of(topology: Topology) -> Structure:
     """The islands of a mechanism, and its fronts where they take less work."""
     islands = _islands(topology)
-    at_once = sum(len(columns) ** 2 * (len(columns) + 2 * len(rows)) for rows, columns in islands)
+    at_once = sum(work_at_once(len(rows), len(columns)) for rows, columns in islands)
     if topology.num_rows == 0 or at_once <= PER_FRONT:
         return Structure(islands, None)
     plan = plan_elimination(topology.read_by_rows, topology.coupled_by_inertia, topology.num_speeds)
