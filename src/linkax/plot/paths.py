@@ -1,5 +1,7 @@
 """Plot the paths of points, such as coupler curves."""
 
+import textwrap
+
 from matplotlib.text import Text
 
 from linkax.plot.drawing import draw
@@ -10,6 +12,7 @@ from linkax.simulation.read.kinematics import Kinematics
 
 PALE = 0.3  # opacity of the mechanism behind the paths
 DOTS_PER_INCH = 100
+LONGEST = 60  # characters of names in the title
 
 
 def path(solution: Kinematics, points: Points) -> Figure:
@@ -38,5 +41,6 @@ def path(solution: Kinematics, points: Points) -> Figure:
         seen, colour = scenery.camera.seen(curve), body_colour(index)
         axes.plot(*seen.T, color=colour, linewidth=1.8, label=name, zorder=5)
         axes.plot(*seen[0], "o", color=colour, markersize=5, zorder=5)
-    axes.set_title(f"Path of {', '.join(points)}", family="sans-serif")  # not the clock's
+    names = textwrap.shorten(", ".join(points), LONGEST, placeholder=" …")
+    axes.set_title(f"Path of {names}", family="sans-serif")  # not the clock's
     return figure
