@@ -22,6 +22,7 @@ from linkax.scenery.camera import gravity, upwards
 from linkax.scenery.colours import BODY_COLOURS, body_colour
 from linkax.scenery.scenery import (
     Scenery,
+    Span,
     is_concentrated,
     is_hinge,
     is_shaped,
@@ -84,7 +85,7 @@ def contents(scenery: Scenery, arrows: dict[str, tuple[Frame, np.ndarray]]) -> t
                 "colour": body_colour(index) if name != GROUND_NAME else "#777777",
                 "position": numbers.add(scenery.poses[name][0]),
                 "quaternion": numbers.add(quaternions(scenery.poses[name][1])),
-                "parts": solids.get(name) or _parts(scenery, name),
+                "parts": solids.get(name) or parts_of(scenery, name),
             }
             for index, name in enumerate(names)
         ],
@@ -93,7 +94,7 @@ def contents(scenery: Scenery, arrows: dict[str, tuple[Frame, np.ndarray]]) -> t
             {
                 "kind": span.kind,
                 "label": span.label,
-                "colour": body_colour(index) if span.kind == "beam" else "#444444",
+                "colour": span_colour(span, index),
                 "points": [place(point) for point in span.points],
             }
             for index, span in enumerate(spans(mechanism))
@@ -120,6 +121,11 @@ def quaternions(axes: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
     return found
 
 
+def span_colour(span: Span, index: int) -> str:
+    """The colour of a span, which is the one of that index."""
+    return body_colour(index) if span.kind == "beam" else "#444444"
+
+
 def _listed(values) -> list[float]:
     return np.asarray(values, np.float64).tolist()
 
@@ -131,24 +137,32 @@ def _label(mechanism, name) -> str:
     return f"{name}: body, {mass:.4g} kg" if mass > 0.0 else f"{name}: body without mass"
 
 
-def _symbol(joint: AbstractJoint, place) -> dict[str, Any]:
-    """The symbol of a joint, on its moving side, with its axes in that body."""
+def symbol_of(joint: AbstractJoint) -> tuple[str | None, Frame, Float[np.ndarray, "3 3"]]:
+    """The symbol of a joint, where it is on its moving side, and its axes in that body, as columns."""
     moving = moving_frame(joint)
     axes = joint.frames()[1 if moving is joint.child else 0]
-    kind = next((symbol for kind, symbol in SYMBOLS.items() if isinstance(joint, kind)), "hinge")
+    return (
+        next((symbol for kind, symbol in SYMBOLS.items() if isinstance(joint, kind)), "hinge"),
+        moving,
+        np.asarray(axes),
+    )
+
+
+def _symbol(joint: AbstractJoint, place) -> dict[str, Any]:
+    kind, moving, axes = symbol_of(joint)
     return {
         "name": joint.name,
         "label": f"{joint.name}: {type(joint).__name__}",
         "kind": kind,
         "at": place(moving),
-        "axes": [_listed(column) for column in np.asarray(axes).T],
+        "axes": [_listed(column) for column in axes.T],
         "ground": [place(frame) for frame in (joint.parent, joint.child) if frame.body == GROUND_NAME],
         "stands": is_hinge(joint),
         "slides": is_slide(joint),
     }
 
 
-def _parts(scenery: Scenery, name: str) -> list[dict[str, Any]]:
+def parts_of(scenery: Scenery, name: str) -> list[dict[str, Any]]:
     """The solids of a body: of its inertia if it has a shape, else those that its marked points span."""
     if name == GROUND_NAME or name in {section for beam in scenery.mechanism.beams for section in beam.sections}:
         return []

@@ -42,17 +42,23 @@ class Meshes:
         return np.concatenate([part.reshape(-1) for part in self._parts]).astype("<u4").tobytes()
 
 
+def shapes_of(mechanism: Mechanism) -> tuple[dict[str, list[Shape]], dict[str, Mesh]]:
+    """The shapes of the bodies that have some, {body: shapes}, without meshes that cannot be read; meshes by path."""
+    shapes = {body.name: body.shape for body in mechanism.bodies if isinstance(body.shape, tuple)}
+    read = read_meshes([str(shape.mesh) for each in shapes.values() for shape in each if shape.mesh])
+    drawn = lambda shape: shape.kind != "mesh" or shape.mesh in read
+    return {name: list(filter(drawn, each)) for name, each in shapes.items()}, read
+
+
 def solids_of(mechanism: Mechanism) -> tuple[dict[str, list[dict[str, Any]]], Meshes]:
     """The solids of the bodies that have shapes, {body: solids}, and their meshes."""
-    shapes = {body.name: body.shape for body in mechanism.bodies if isinstance(body.shape, tuple)}
-    meshes = Meshes(read_meshes([str(shape.mesh) for each in shapes.values() for shape in each if shape.mesh]))
+    shapes, read = shapes_of(mechanism)
+    meshes = Meshes(read)
     return {name: [part for shape in each for part in _solids(shape, meshes)] for name, each in shapes.items()}, meshes
 
 
 def _solids(shape: Shape, meshes: Meshes) -> list[dict[str, Any]]:
-    """What a shape is drawn by; nothing for a mesh that could not be read."""
-    if shape.kind == "mesh" and str(shape.mesh) not in meshes.index:
-        return []
+    """What a shape is drawn by."""
     size, at = np.array(shape.size), shape.pose
     if FORMS[shape.kind] == "cylinder":
         extent = np.array([2.0 * size[0], 2.0 * size[0], size[1]])
