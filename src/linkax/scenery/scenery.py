@@ -119,7 +119,9 @@ def reached(solution: Moving) -> Moving:
     if solution.q is None:
         raise ValueError("the solution saved functions of its own; draw one that saved its states")
     if np.ndim(solution.ts) != 1:
-        raise ValueError(f"the solution is a batch of shape {np.shape(solution.ts)[:-1]}; draw one of its members")
+        member = "take jax.tree.map(lambda x: x[0], solution)"
+        shape = np.shape(solution.ts)[:-1]
+        raise ValueError(f"the solution is a batch of shape {shape}; draw one of its members: {member}")
     times = np.asarray(solution.ts)
     there = np.isfinite(times)
     if np.all(there) and np.all(np.diff(times) > 0.0):
