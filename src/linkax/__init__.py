@@ -208,8 +208,9 @@ from linkax.xla.program_cache import cache_programs as cache_programs  # noqa: E
 if _TYPE_CHECKING:
     from linkax import plot as plot
     from linkax.view import View as View
+    from linkax.view import to_usd as to_usd
 
-_LATER = {"plot": "linkax.plot", "View": "linkax.view"}  # with matplotlib, or SciPy
+_LATER = {"plot": "linkax.plot", "View": "linkax.view", "to_usd": "linkax.view"}  # with matplotlib, or SciPy
 
 
 def __getattr__(name: str) -> _Any:

@@ -199,15 +199,15 @@ def read_xml(path: Path) -> Node:
     return roots[0]
 
 
-def library(module: str, path: Path, reads: str) -> Any:
-    """Import the library that reads a format.
+def library(module: str, path: Path, reads: str, does: str = "reads") -> Any:
+    """Import the library that reads or writes a format.
 
     **Raises:** `MachineFileError` that says how to install it.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise MachineFileError(f"{path.name} is {reads} reads; pip install 'linkax[files]'") from error
+        raise MachineFileError(f"{path.name} is {reads} {does}; pip install 'linkax[files]'") from error
 
 
 def below(folder: Path, name: str, roots: Sequence[Path], fail: Callable[[str], MachineFileError]) -> Path:
