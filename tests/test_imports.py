@@ -10,7 +10,8 @@ import linkax
 SOURCE = Path(linkax.__file__).parent
 CONTRIBUTING = Path(__file__).parents[1] / "CONTRIBUTING.md"
 # From the lowest to the highest, as CONTRIBUTING says: rooms of a layer as layer.room.
-LAYERS = ["files", "xla", "tables", "straight_line", "spatial", "model", "linalg", "equations", "formulations"]
+LAYERS = ["files", "optional", "xla", "tables", "straight_line", "spatial", "model", "linalg", "equations"]
+LAYERS += ["formulations"]
 LAYERS += [f"simulation.{room}" for room in ("start", "integrate", "explain", "read", "simulate")]
 LAYERS += ["analysis"]
 LAYERS += [f"studies.{room}" for room in ("parameters", "laboratory", "fits", "sweeps", "tolerances", "synthesis")]

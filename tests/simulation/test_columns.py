@@ -85,7 +85,7 @@ def test_a_dataframe_needs_pandas(solution, monkeypatch):
     check(solution, frame.columns, lambda name: frame[name].to_numpy())
     assert frame.attrs["units"]["speed.socket.0"] == "rad/s"
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match=r"needs pandas: pip install 'linkax\[records\]'"):
+    with pytest.raises(ImportError, match=r"needs pandas; pip install 'linkax\[records\]'"):
         solution.to_dataframe()
 
 

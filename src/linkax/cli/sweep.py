@@ -1,7 +1,6 @@
 """The command `linkax sweep STUDY.py`, which evaluates the function of a file for all of its parameters."""
 
 import argparse
-import importlib
 import json
 import os
 import sys
@@ -19,6 +18,7 @@ import linkax as lx
 from linkax.cli.options import AtInterrupt
 from linkax.cli.report import finite
 from linkax.files import writable_folder
+from linkax.optional import needed
 from linkax.xla.enumerations import code
 
 NEEDED = {"function": "a function of one member's params", "params": "arrays with one entry for each member"}
@@ -116,10 +116,8 @@ def _executor(scheduler: str | None, study: ModuleType) -> Iterator[Executor | N
     if scheduler is None:
         yield None
         return
-    try:
-        distributed, cloudpickle = map(importlib.import_module, ("distributed", "cloudpickle"))
-    except ImportError as error:
-        raise ValueError(f'--scheduler {scheduler!r} needs Dask; pip install "linkax[cluster]"') from error
+    need = f"--scheduler {scheduler!r} needs Dask"
+    distributed, cloudpickle = (needed(name, need, "cluster", ValueError) for name in ("distributed", "cloudpickle"))
     cloudpickle.register_pickle_by_value(study)
     try:
         client = distributed.Client(scheduler)

@@ -1,6 +1,5 @@
 """XML with the line of each element, read without entities, and no larger than a machine is."""
 
-import importlib
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -9,6 +8,8 @@ from typing import Any, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
+
+from linkax.optional import needed
 
 LARGEST = 64 * 2**20  # bytes of a file
 DEEPEST = 200  # elements inside each other
@@ -199,15 +200,12 @@ def read_xml(path: Path) -> Node:
     return roots[0]
 
 
-def library(module: str, path: Path, reads: str, does: str = "reads") -> Any:
+def library(module: str, path: Path, reads: str) -> Any:
     """Import the library that reads or writes a format.
 
     **Raises:** `MachineFileError` that says how to install it.
     """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise MachineFileError(f"{path.name} is {reads} {does}; pip install 'linkax[files]'") from error
+    return needed(module, f"{path.name} is {reads} reads", "files", MachineFileError)
 
 
 def below(folder: Path, name: str, roots: Sequence[Path], fail: Callable[[str], MachineFileError]) -> Path:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from linkax.machines.xml import read_file
+from linkax.optional import needed
 from linkax.xla.users_line import warn
 
 FORMATS = ("stl", "obj", "dae")
@@ -39,10 +40,7 @@ def read_meshes(paths: list[str]) -> dict[str, Mesh]:
 
 
 def _read(path: Path) -> Mesh:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ValueError("trimesh reads it; pip install 'linkax[files]'") from error
+    trimesh = needed("trimesh", "trimesh reads it", "files")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS or kind not in trimesh.available_formats():
         raise ValueError(f"a mesh of format {kind!r} is not read; convert it to STL or OBJ{MORE.get(kind, '')}")

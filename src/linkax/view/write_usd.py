@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.files import written_whole
-from linkax.machines.xml import library
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.joint import AbstractJoint
 from linkax.model.numbers import Number, positive, require_type
 from linkax.model.shapes import Shape
+from linkax.optional import needed
 from linkax.scenery.camera import upwards
 from linkax.scenery.colours import body_colour
 from linkax.scenery.scenery import Scenery, Span, is_slide, moving_frame, scenery_of, spans
@@ -79,7 +79,8 @@ def to_usd(solution: Kinematics, path: str | os.PathLike[str], *, speed: Number 
         raise ValueError(f"{str(path)!r} has suffix {path.suffix!r}; known: {', '.join(SUFFIXES)}")
     require_type(solution, Kinematics, "solution", "give a linkax.Solution")
     rate = CODES_PER_SECOND / float(positive(speed, "speed"))
-    pxr = SimpleNamespace(**{name: library(f"pxr.{name}", path, "USD, which usd-core", "writes") for name in MODULES})
+    need = f"{path.name} is USD, which usd-core writes"
+    pxr = SimpleNamespace(**{name: needed(f"pxr.{name}", need, "files", ValueError) for name in MODULES})
     stage = _Writer(pxr, scenery_of(solution, {}), rate).stage
     try:
         with written_whole(path) as unfinished:

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from linkax.files import UNFINISHED, written_whole
+from linkax.optional import needed
 from linkax.simulation.read.kinematics import Kinematics
 
 AXES = ("x", "y", "z")
 QUATERNION = ("w", "x", "y", "z")
 SUFFIXES = (".csv", ".parquet", ".zarr")
+PARQUET = "a file of Parquet needs pyarrow"
 
 
 def columns(solution: Kinematics) -> dict[str, tuple[np.ndarray, str]]:
@@ -51,7 +53,7 @@ def columns(solution: Kinematics) -> dict[str, tuple[np.ndarray, str]]:
 def to_dataframe(solution: Kinematics) -> Any:
     """The columns as a pandas.DataFrame, with their units in `attrs`."""
     found = columns(solution)
-    pandas: Any = needed("pandas", "a DataFrame")
+    pandas: Any = needed("pandas", "a DataFrame needs pandas", "records")
     frame = pandas.DataFrame({name: values for name, (values, _) in found.items()})
     frame.attrs["units"] = {name: unit for name, (_, unit) in found.items()}
     return frame
@@ -80,8 +82,7 @@ def _quoted(name):
 
 
 def _parquet(path, found):
-    arrow: Any = needed("pyarrow", "a file of Parquet")
-    parquet: Any = needed("pyarrow.parquet", "a file of Parquet")
+    arrow, parquet = (needed(module, PARQUET, "records") for module in ("pyarrow", "pyarrow.parquet"))
     fields = [arrow.field(name, arrow.float64(), metadata={"unit": unit}) for name, (_, unit) in found.items()]
     arrays = [arrow.array(np.asarray(values, dtype=float)) for values, _ in found.values()]
     parquet.write_table(arrow.Table.from_arrays(arrays, schema=arrow.schema(fields)), path)
@@ -101,14 +102,3 @@ def _zarr(path, found):
         if path.exists():
             path.rename(Path(folder) / "before")
         unfinished.rename(path)
-
-
-def needed(module: str, what: str) -> Any:
-    """Import a module that is optional.
-
-    **Raises:** `ImportError` that says how to install it.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"{what} needs {module.partition('.')[0]}: pip install 'linkax[records]'") from error

@@ -12,6 +12,8 @@ from jaxtyping import ArrayLike, Float
 
 from linkax.model.names import ByName
 from linkax.model.numbers import one_of, positive, real, require_type
+from linkax.optional import needed
+from linkax.simulation.read.columns import PARQUET
 from linkax.tables import Rows, Table, count, numbers, printed_as
 from linkax.xla.arrays import Array
 
@@ -257,21 +259,18 @@ def _cell(text, path, line, column) -> float:
 
 
 def _read_parquet(path, asked) -> dict[str, np.ndarray]:
-    try:
-        from pyarrow import ArrowInvalid, ArrowNotImplementedError, parquet
-    except ImportError as error:
-        raise ImportError("a file of Parquet needs pyarrow: pip install 'linkax[records]'") from error
+    arrow, parquet = (needed(module, PARQUET, "records") for module in ("pyarrow", "pyarrow.parquet"))
     try:
         with parquet.ParquetFile(path) as file:
             _places(path, file.schema_arrow.names, asked)
             table = file.read(columns=asked)
-    except ArrowInvalid as error:
+    except arrow.ArrowInvalid as error:
         raise ValueError(f"{str(path)!r} is no file of Parquet: {error}") from error
     found = {}
     for name in asked:
         try:
             found[name] = table.column(name).cast("double").to_numpy()
-        except (ArrowInvalid, ArrowNotImplementedError) as error:
+        except (arrow.ArrowInvalid, arrow.ArrowNotImplementedError) as error:
             raise ValueError(
                 f"column {name!r} of {str(path)!r} has no numbers, but {table.schema.field(name).type}"
             ) from error
