@@ -172,7 +172,7 @@ def _one_of(choices: Iterable[str]) -> Callable[[str], str]:
 
 
 def _unknown(text, known, what="") -> str:
-    """What to say of an unknown word."""
+    """What to say of an unknown word, in the words of `linkax.model.names.meant`, which would import JAX."""
     from difflib import get_close_matches
 
     meant = "".join(f" (did you mean {close!r}?)" for close in get_close_matches(text.lower(), known, 1))

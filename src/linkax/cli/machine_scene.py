@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from linkax.machines.machine import Machine, Start
-from linkax.machines.parts import meant
 from linkax.model.constraints.constraint import Drive
 from linkax.model.mechanism import Mechanism
+from linkax.model.names import meant
 from linkax.scenes.scene import Scene, Variant
 from linkax.simulation.start.assembly import assemble
 from linkax.simulation.start.state import State

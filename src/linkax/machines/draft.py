@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.machines.machine import LeftOut, Machine, Start
-from linkax.machines.parts import Part, Place, ground, meant
+from linkax.machines.parts import Part, Place, ground
 from linkax.machines.poses import relative, turned, whole
 from linkax.machines.xml import MachineFileError, Where
 from linkax.model.bodies import GROUND_NAME, RigidBody
@@ -20,6 +20,7 @@ from linkax.model.forces.joint_limits import JointLimit
 from linkax.model.forces.point_forces import PointForce
 from linkax.model.joints.fixed import Fixed
 from linkax.model.joints.free import Free
+from linkax.model.names import meant
 from linkax.model.shapes import Shape
 from linkax.xla.users_line import warn
 

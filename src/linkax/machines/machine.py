@@ -7,9 +7,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from linkax.machines.parts import Part, meant
+from linkax.machines.parts import Part
 from linkax.machines.xml import Where
 from linkax.model.mechanism import Mechanism
+from linkax.model.names import meant
 from linkax.model.shapes import Shape
 from linkax.tables import Rows, Table, count, printed_as
 

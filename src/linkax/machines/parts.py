@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Mapping
-from difflib import get_close_matches
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ from jaxtyping import Float
 
 from linkax.machines.xml import MachineFileError, Where
 from linkax.model.bodies import GROUND_NAME, Frame
+from linkax.model.names import meant
 from linkax.model.numbers import Constant, number
 
 STRUCTURE = ("axis", "second_axis")  # arguments that are numbers, and no parameters
@@ -100,11 +100,6 @@ def _with(entry, other, where, name):
     if isinstance(entry, Mapping):
         return _merged(entry, {} if other is None else other, where)
     return entry if other is None else other
-
-
-def meant(name: str, known: Any) -> str:
-    """What to say of an unknown name that is close to a known one."""
-    return "".join(f" (did you mean {close!r}?)" for close in get_close_matches(str(name), list(map(str, known)), 1))
 
 
 def ground(pose: Float[np.ndarray, "4 4"]) -> Place:

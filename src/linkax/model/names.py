@@ -1,6 +1,6 @@
 """Names of elements: checked, and found among those that are known."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, TypeVar
 
@@ -47,7 +47,7 @@ def _unknown(name, names, what) -> str:
     return f"unknown {what} {name!r}{meant(name, names)}; known: {', '.join(map(repr, names)) or 'none'}"
 
 
-def meant(name: Any, names: Sequence[str]) -> str:
+def meant(name: Any, names: Iterable[str]) -> str:
     """Ask whether the closest of names was meant, in words for after an unknown one; nothing where none is close."""
     close = get_close_matches(name, names, 1) if isinstance(name, str) else []
     return "".join(f" (did you mean {other!r}?)" for other in close)

@@ -8,13 +8,13 @@ import math
 import operator
 import tomllib
 from collections.abc import Callable, Mapping
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from linkax.model.mechanism import Mechanism
+from linkax.model.names import meant
 from linkax.simulation.start.state import State
 from linkax.xla.tracing import concrete
 
@@ -78,7 +78,8 @@ class Scene:
         """
         name = self.default_variant if name is None else name
         if name not in self.variants:
-            raise ValueError(f"scene {self.name!r} has no variant {name!r}; known: {', '.join(self.variants)}")
+            known = ", ".join(self.variants)
+            raise ValueError(f"scene {self.name!r} has no variant {name!r}{meant(name, self.variants)}; known: {known}")
         return self.variants[name]
 
     def settings(self, variant: str | None = None, changes: Parameters | None = None) -> dict[str, Any]:
@@ -100,10 +101,8 @@ class Scene:
     def _checked(self, name: str, entry: Any) -> Any:
         if name not in self.parameters:
             known = [*self.parameters]
-            close = get_close_matches(name, known, 1, 0.8) if len(known) > MOST_NAMES else ()
-            meant = f" (did you mean {close[0]!r}?)" if close else ""
             shown = ", ".join(known[:MOST_NAMES]) + (", ..." if len(known) > MOST_NAMES else "")
-            raise ValueError(f"scene {self.name!r} has no parameter {name!r}{meant}; known: {shown}")
+            raise ValueError(f"scene {self.name!r} has no parameter {name!r}{meant(name, known)}; known: {shown}")
         read = _count if isinstance(self.parameters[name], int) else _finite
         try:
             return read(entry)
