@@ -244,14 +244,15 @@ def test_results_of_another_run_are_never_replaced(file, tmp_path, monkeypatch):
 def test_each_run_has_a_default_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
-    def run(**changes):
+    def run(*more, **changes):
         settings = SETTINGS | changes
-        found = options.output_folder(None, "crank-slider", settings, ("summary.json",))
+        name = options.RunOptions(parser.parsed(["simulate", "crank-slider", *more])).folder
+        found = options.output_folder(None, name, settings, ("summary.json",))
         (found / "summary.json").write_text(json.dumps(settings))
         return found.as_posix()
 
     for _ in range(2):
-        assert run() == "linkax-out/crank-slider"
+        assert run() == run("--variant", "SC1") == "linkax-out/crank-slider"
         assert run(t1=3.0) == "linkax-out/crank-slider-2"
         assert run(t1=4.0) == "linkax-out/crank-slider-3"
-        assert run(variant="SC2") == "linkax-out/crank-slider-SC2"
+        assert run("--variant", "SC2", variant="SC2") == "linkax-out/crank-slider-SC2"

@@ -51,7 +51,7 @@ def run_compare(arguments: argparse.Namespace, at_interrupt: AtInterrupt) -> int
         "equal": EQUAL[arguments.equal],
         "all_rows": arguments.all_rows,
     }
-    out = output_folder(arguments.out, f"compare-{asked.scene.name}", settings, ("comparison.json", PART))
+    out = output_folder(arguments.out, f"compare-{asked.folder}", settings, ("comparison.json", PART))
     at_interrupt_in(at_interrupt, out)
     exact = asked.scene.exact
     comparison = compare(

@@ -1,12 +1,14 @@
 """A machine from a file as a scene: what the command line simulates."""
 
-import re
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from linkax.machines.machine import Machine, Start
+from linkax.machines.parts import Part
 from linkax.model.constraints.constraint import Drive
 from linkax.model.mechanism import Mechanism
 from linkax.model.names import meant
@@ -33,60 +35,72 @@ def machine_scene(machine: Machine, start: str | None = None, hold: Mapping[str,
         if joint not in joints:
             raise ValueError(f"{machine.path.name} has no joint {joint!r} to hold{meant(joint, joints)}")
     starts = {DRAWN: Start({}, {}), **machine.starts}
-    variants = {name: Variant(f"at {name}") for name in starts}
-    begin = starts.get(DRAWN if start is None else start)  # an unknown one is refused with the variants
-    parameters = dict(_flat(machine.params))
+    begin = starts.get(DRAWN if start is None else start, starts[DRAWN])  # an unknown one is refused with the variants
+    held = dataclasses.replace(machine, constraints=(*machine.constraints, *_motors(machine, hold)))
+    drawn = {name: float(array[at]) for path, array in _arrays(machine.params) for name, at in _entries(path, array)}
+
+    @lru_cache(maxsize=1)
+    def made(*changed: tuple[str, float]) -> Mechanism:
+        return held.mechanism(_nested(machine.params, dict(changed)))
+
+    def mechanism(parameters: Mapping[str, Any]) -> Mechanism:
+        return made(*(pair for pair in parameters.items() if pair not in drawn.items()))
+
     return Scene(
         name=machine.path.stem,
         summary=f"machine {machine.name!r} from {machine.path.name}",
-        parameters=parameters,
-        meanings={name: "" for name in parameters},
-        variants=variants,
+        parameters=drawn,
+        meanings={name: "" for name in drawn},
+        variants={name: Variant(f"at {name}") for name in starts},
         default_variant=DRAWN,
         t1=T1,
-        mechanism=lambda parameters: _mechanism(machine, parameters, hold),
-        initial=lambda mechanism, parameters: _initial(mechanism, begin or starts[DRAWN], hold),
-        points=lambda parameters: {name: (name, None) for name in _ends(machine.mechanism())},
+        mechanism=mechanism,
+        initial=lambda mechanism, parameters: _initial(mechanism, begin, hold),
+        points=lambda parameters: {name: (name, None) for name in _ends(mechanism(parameters))},
     )
 
 
-def _mechanism(machine: Machine, parameters: Mapping[str, Any], hold: Mapping[str, float]) -> Mechanism:
-    drawn = dict(_flat(machine.params))
-    changed = {name: entry for name, entry in parameters.items() if entry != drawn[name]}
-    made = machine.mechanism(_nested(machine.params, changed))
-    drives = [Drive(f"hold {joint}", joint, speed=0.0, start=at) for joint, at in hold.items()]
-    return Mechanism(made.bodies, made.joints, made.forces, [*made.constraints, *drives]) if drives else made
+def _motors(machine: Machine, hold: Mapping[str, float]) -> Iterator[Part]:
+    """Drives of the joints that are held."""
+    for joint in machine.joints:
+        if joint.name in hold:
+            arguments = {"name": f"hold {joint.name}", "joint": joint.name, "speed": 0.0, "start": hold[joint.name]}
+            yield Part(Drive, arguments, joint.where, frozenset(arguments))
 
 
 def _initial(mechanism: Mechanism, start: Start, hold: Mapping[str, float]) -> State:
     return assemble(mechanism, hold, start.speeds, guess=start.positions)
 
 
-def _flat(params: Any, prefix: str = "") -> Sequence[tuple[str, float]]:
-    """(name, number) of all numbers, with [i] for entries of arrays."""
-    if isinstance(params, Mapping):
-        dot = prefix and prefix + "."
-        return [pair for name, entry in params.items() for pair in _flat(entry, f"{dot}{name}")]
-    array = np.asarray(params, dtype=float)
-    return [(prefix + "".join(f"[{i}]" for i in index), float(array[index])) for index in np.ndindex(array.shape)]
+def _arrays(params: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
+    """All numbers as arrays, each with the names that lead to it."""
+    if not isinstance(params, Mapping):
+        yield path, np.array(params, dtype=float)
+        return
+    for name, entry in params.items():
+        yield from _arrays(entry, (*path, name))
 
 
-def _nested(params: Any, changed: Mapping[str, float], prefix: str = "") -> dict[str, Any]:
+def _entries(path: tuple[str, ...], array: np.ndarray) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """The dotted name of each entry, with [i] in an array, and its index."""
+    for index in np.ndindex(array.shape):
+        yield ".".join(path) + "".join(f"[{i}]" for i in index), index
+
+
+def _nested(params: Any, changed: Mapping[str, float]) -> dict[str, Any]:
     """What `Machine.mechanism` takes, of numbers that have changed."""
     found = {}
-    for name, entry in params.items():
-        full = f"{prefix}.{name}" if prefix else name
-        own = {key: value for key, value in changed.items() if re.match(rf"{re.escape(full)}(\.|\[|$)", key)}
+    for path, array in _arrays(params):
+        own = {index: changed[name] for name, index in _entries(path, array) if name in changed}
         if not own:
             continue
-        if isinstance(entry, Mapping):
-            found[name] = _nested(entry, own, full)
-            continue
-        array = np.array(entry, dtype=float)
-        for index in np.ndindex(array.shape):
-            key = full + "".join(f"[{i}]" for i in index)
-            array[index] = own.get(key, array[index])
-        found[name] = array
+        for index, number in own.items():
+            array[index] = number
+        *groups, last = path
+        inner = found
+        for group in groups:
+            inner = inner.setdefault(group, {})
+        inner[last] = array
     return found
 
 

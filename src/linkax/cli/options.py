@@ -11,7 +11,7 @@ from typing import Any, SupportsFloat, cast
 import diffrax
 
 import linkax as lx
-from linkax.cli.machine_scene import DRAWN, machine_scene
+from linkax.cli.machine_scene import machine_scene
 from linkax.files import remove_unfinished, writable_folder, written_whole
 from linkax.scenes import SCENES, Scene, scene
 from linkax.simulation.integrate.default_solver import default_solver
@@ -87,6 +87,12 @@ class RunOptions:
         known = self.scene.parameters if self.is_of_file else {}
         return {name: entry for name, entry in self.parameters.items() if known.get(name) != entry}
 
+    @property
+    def folder(self) -> str:
+        """The name of a folder for its results: that of the scene, with -VARIANT where that is not the default."""
+        is_default = self.variant == self.scene.default_variant
+        return self.scene.name if is_default else f"{self.scene.name}-{self.variant}"
+
     def initial(self, mechanism: lx.Mechanism) -> lx.State:
         """Assemble the initial state.
 
@@ -137,14 +143,14 @@ def _coordinate(joint, text) -> float:
         raise ValueError(f"--hold {joint}={text!r} is no number; write --hold JOINT=VALUE [rad or m]") from error
 
 
-def output_folder(asked: Path | None, prefix: str, settings: dict[str, Any], files: Iterable[str]) -> Path:
+def output_folder(asked: Path | None, name: str, settings: dict[str, Any], files: Iterable[str]) -> Path:
     """The folder asked for, or one under linkax-out without results of other settings; checked before the run.
 
-    **Arguments:** `prefix`: of the default folder's name. `files`: JSON files with the settings of a folder's results.
+    **Arguments:** `name`: of the default folder. `files`: JSON files with the settings of a folder's results.
 
     **Raises:** `ValueError` for a folder that cannot be written to, or holds results of other settings.
     """
-    folder = _free_folder(prefix, settings, files) if asked is None else asked
+    folder = _free_folder(name, settings, files) if asked is None else asked
     writable_folder(folder, "give another by --out")
     other = _other_setting(folder, settings, files)
     if other is None:
@@ -154,11 +160,8 @@ def output_folder(asked: Path | None, prefix: str, settings: dict[str, Any], fil
     )
 
 
-def _free_folder(prefix, settings, files):
-    """linkax-out/SCENE, with -VARIANT where that is not the default, and -2, ... where others hold other results."""
-    variant = settings["variant"]
-    is_default = variant in (DRAWN, SCENES[settings["scene"]].default_variant if settings["scene"] in SCENES else None)
-    name = prefix + ("" if is_default else f"-{variant}")
+def _free_folder(name, settings, files):
+    """linkax-out/NAME, with -2, ... where others hold other results."""
     names = itertools.chain([name], (f"{name}-{count}" for count in itertools.count(2)))
     folders = map(Path("linkax-out").joinpath, names)
     return next(folder for folder in folders if _other_setting(folder, settings, files) is None)

@@ -36,7 +36,7 @@ def run_simulate(arguments: argparse.Namespace, at_interrupt: AtInterrupt) -> in
     """Simulate, write the files, print a summary, and return the exit code."""
     asked, chosen = RunOptions(arguments), formulation(arguments.formulation)
     settings = asked.described | {"formulation": arguments.formulation}
-    out = output_folder(arguments.out, asked.scene.name, settings, ("summary.json", PART[1]))
+    out = output_folder(arguments.out, asked.folder, settings, ("summary.json", PART[1]))
     at_interrupt_in(at_interrupt, out)
     run = simulate_in_segments(
         asked.mechanism,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.machines.machine import LeftOut, Machine, Start
-from linkax.machines.parts import Part, Place, ground
+from linkax.machines.parts import Part, Place
 from linkax.machines.poses import relative, turned, whole
 from linkax.machines.xml import MachineFileError, Where
 from linkax.model.bodies import GROUND_NAME, RigidBody
@@ -245,10 +245,9 @@ class Draft:
             if body.name in reached:
                 continue
             kind, word = (Free, "free") if base == "free" else (Fixed, "fixed")
-            pose, child = self.poses[body.name], Place.at(body.name, np.eye(4))
-            self.joints.insert(
-                0, Part(kind, {"name": f"{body.name}.{word}", "parent": ground(pose), "child": child}, body.where)
-            )
+            parent, child = Place.at(GROUND_NAME, self.poses[body.name]), Place.at(body.name, np.eye(4))
+            arguments = {"name": f"{body.name}.{word}", "parent": parent, "child": child}
+            self.joints.insert(0, Part(kind, arguments, body.where))
             reached |= _connected(neighbours, body.name)
 
     @property

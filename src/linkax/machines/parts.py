@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.machines.xml import MachineFileError, Where
-from linkax.model.bodies import GROUND_NAME, Frame
+from linkax.model.bodies import Frame
 from linkax.model.names import meant
 from linkax.model.numbers import Constant, number
 
@@ -100,8 +100,3 @@ def _with(entry, other, where, name):
     if isinstance(entry, Mapping):
         return _merged(entry, {} if other is None else other, where)
     return entry if other is None else other
-
-
-def ground(pose: Float[np.ndarray, "4 4"]) -> Place:
-    """A place on the ground."""
-    return Place.at(GROUND_NAME, pose)
