@@ -2,8 +2,8 @@
 
 Of files, `found`: of each loops, degrees of freedom, redundant rows, and how far open `linkax.assemble` leaves loops,
 relative to their length. `pinocchio`: accelerations against `constraintDynamics`, a proximal solve with hard loops, of
-a model with the same numbers, at twenty states of a motion. `mujoco`: how far a motion is from MuJoCo's, whose
-equalities are soft, as they are stiffened with shorter steps.
+a model with the same numbers, at twenty states of a motion. `mujoco`: how far a motion of one second is from MuJoCo's,
+whose equalities are soft, as they are stiffened with shorter steps.
 
 Of the scenes of machines, `pins`: of an excavator and a Delta robot, let go without motors, how far pins that close
 loops are apart at most [m] here, and in MuJoCo as it comes and stiffened; and the largest force at each pin [N].
@@ -37,7 +37,7 @@ OF_HINGES = (("robotiq_2f85_v2.xml", None), ("xarm7_gripper.xml", None), ("cassi
 STATES = 20
 STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1.25e-4)
 STIFF = 2.0  # steps in which MuJoCo's gaps decay
-FALL = 0.3  # seconds
+FALL = 0.3  # of pins [s]
 SOFTNESS = {"default": None, **{f"stiffened, step {step}": step for step in (1e-3, 1e-4)}}
 RINGS = ((6, 1), (12, 1), (12, 2), (24, 2), (24, 3), (24, 5))  # pairs in a ring, rings
 
@@ -149,7 +149,7 @@ def beside_pinocchio(name, base):
 
 def beside_mujoco(name):
     """How far bodies are from MuJoCo's over a second, relative to how far they move, by MuJoCo's step."""
-    times = np.linspace(0.0, 0.5, 51)
+    times = np.linspace(0.0, 1.0, 101)
     machine = load(f"{name}.xml")
     ours = falling(machine, times)
     rows = {}
