@@ -3,18 +3,13 @@
 import sys
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from beside_mujoco import matrix_of_speeds, positions, tree_dynamics
 
 import linkax as lx
-from linkax.equations.configuration import configure
-from linkax.equations.dynamics import generalised_force, mass_matrix
-from linkax.equations.motion import move
-from linkax.equations.system import system_of
 
 MACHINES = Path(__file__).parents[1] / "data" / "machines"
 # A tree with all kinds of joints, several on one body, springs, dampers, rotors, a tendon and actuators; no loops.
@@ -57,23 +52,6 @@ TREE = """<mujoco model="tree">
 CONTROLS = {"servo": 0.4, "motor": -0.2, "general": 0.7}
 
 
-def positions_in_mujoco(model, machine, mechanism, state):
-    """qpos at a state."""
-    qpos, drawn = np.array(model.qpos0), dict(machine.starts)["key"].positions
-    for index, name in enumerate(drawn):
-        joint, at = model.joint(index), model.joint(index).qposadr[0]
-        q = np.array(state.q[mechanism.topology.coordinates[name]])
-        if joint.type[0] == mujoco.mjtJoint.mjJNT_FREE.value:
-            here = Rotation.from_quat(qpos[at + 3 : at + 7], scalar_first=True)
-            turned = here * Rotation.from_quat(q[:4], scalar_first=True)
-            qpos[at : at + 7] = [*(qpos[at : at + 3] + here.apply(q[4:])), *turned.as_quat(scalar_first=True)]
-        elif joint.type[0] == mujoco.mjtJoint.mjJNT_BALL.value:
-            qpos[at : at + 4] = q
-        else:
-            qpos[at] += q[0]
-    return qpos
-
-
 def compiled(text):
     """MuJoCo's model of a text, without the meshes that are not there."""
     spec = mujoco.MjSpec.from_string(text)
@@ -105,32 +83,6 @@ def state_of(mechanism, start):
     order = mechanism.topology.coordinates
     flat = lambda given: np.concatenate([np.atleast_1d(given[name]) for name in order if name in given])
     return lx.State(jnp.asarray(flat(start.positions)), jnp.asarray(flat(start.speeds)), mechanism.topology)
-
-
-def matrix_of_speeds(model, mechanism, names, qpos):
-    """The matrix from qvel, and qacc, to linkax's speeds: of balls and free bodies in the parent's axes."""
-    found = np.zeros((mechanism.topology.num_speeds, model.nv))
-    turn = lambda quaternion: Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    for index, name in enumerate(names):
-        joint = model.joint(index)
-        row, dof, at = mechanism.topology.speeds[name], joint.dofadr[0], joint.qposadr[0]
-        if joint.type[0] == mujoco.mjtJoint.mjJNT_FREE.value:
-            drawn = turn(model.body_quat[joint.bodyid[0]]).T
-            found[row.start : row.start + 3, dof + 3 : dof + 6] = drawn @ turn(qpos[at + 3 : at + 7])
-            found[row.start + 3 : row.stop, dof : dof + 3] = drawn
-        elif joint.type[0] == mujoco.mjtJoint.mjJNT_BALL.value:
-            found[row, dof : dof + 3] = turn(qpos[at : at + 4])
-        else:
-            found[row, dof] = 1.0
-    return found
-
-
-@jax.jit
-def tree_dynamics(mechanism, state):
-    configuration = configure(system_of(mechanism, np.float64), 0.0, state.q)
-    motion = move(configuration, state.v)
-    mass, force = mass_matrix(configuration), generalised_force(motion)
-    return mass, jnp.linalg.solve(mass, force), configuration.world_center_of_mass()
 
 
 def of_package(name, *disabled):
@@ -165,7 +117,8 @@ def test_a_tree_moves_as_in_mujoco(name, tmp_path):
         data.qpos, data.qvel, data.ctrl = qpos, qvel, list(controls.values()) or 0.0
         mujoco.mj_forward(model, data)
         state = state_of(mechanism, start)
-        mass, acceleration, centers = tree_dynamics(mechanism, state)
+        mass, force, centers = tree_dynamics(mechanism, state)
+        acceleration = np.linalg.solve(mass, force)
         into = matrix_of_speeds(model, mechanism, start.positions, data.qpos)
         mujoco.mj_fullM(model, data, full)
         assert np.abs(into @ data.qvel - state.v).max() < 1e-13
@@ -227,7 +180,7 @@ def test_equalities_hold_in_mujoco_where_loops_are_closed():
     state = lx.assemble(mechanism)
     model = compiled((MACHINES / "constraints.xml").read_text())
     data = mujoco.MjData(model)
-    data.qpos = positions_in_mujoco(model, machine, mechanism, state)
+    data.qpos = positions(model, mechanism, dict(machine.starts)["key"].positions, state.q)
     mujoco.mj_forward(model, data)
     held = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY.value
 
