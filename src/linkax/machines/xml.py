@@ -201,7 +201,7 @@ def read_xml(path: Path) -> Node:
 
 
 def library(module: str, path: Path, reads: str) -> Any:
-    """Import the library that reads or writes a format.
+    """Import the library that reads a format.
 
     **Raises:** `MachineFileError` that says how to install it.
     """
