@@ -110,6 +110,20 @@ def test_poses_are_relative_to_frames(tmp_path):
     assert np.allclose(weld.arguments["parent"].rotation[:, 0], [0.0, 1.0, 0.0])
 
 
+@pytest.mark.parametrize(
+    ("model", "attached", "link"),
+    [("", "", "crank"), ("", ' attached_to="__model__"', "crank"), (' canonical_link="rocker"', "", "rocker")],
+)
+def test_a_frame_on_the_model_is_on_its_canonical_link(tmp_path, model, attached, link):
+    """The first link of the file, whatever its name, or the one that the model names."""
+    more = f"""<frame name="top"{attached}><pose>0 0 1 0 0 0</pose></frame><link name="tip">{INERTIAL}</link>
+    <joint name="weld" type="fixed"><parent>top</parent><child>tip</child></joint>"""
+    text = FOUR_BAR.format(version="1.7", inertial=INERTIAL, axis=ALONG_Y, more=more)
+    machine = load(tmp_path / "on_model.sdf", text.replace('name="four_bar"', f'name="four_bar"{model}'))
+    weld = next(joint for joint in machine.joints if joint.name == "weld")
+    assert weld.arguments["parent"].body == link
+
+
 def test_a_mimic_and_a_gearbox_are_couplings(tmp_path):
     follows = """<axis><xyz>0 1 0</xyz><mimic joint="crank_bearing">
       <multiplier>2</multiplier><offset>0.3</offset><reference>0.1</reference>
@@ -161,6 +175,7 @@ WRONG = (
     (IN_A_CIRCLE, "circle"),
     ('<link name="x"><pose>0 0 zero 0 0 0</pose></link>', r":11: pose: .*'0 0 zero 0 0 0'; it must be 6 finite"),
     ("<link/>", "it has no name"),
+    (JOINT.format(name="j", kind="fixed", parent="top") + '<frame name="top" attached_to="top"/>', "to itself; attach"),
     ('<link name="x"><inertial><mass>-1</mass></inertial></link>', r"link 'x'.*mass"),
     ("<include><uri>model://other</uri></include>", r'ignore=\["include"\]'),
 )

@@ -27,7 +27,7 @@ KINDS = {
 }  # fmt: skip
 DEFAULT_GRAVITY = (0.0, 0.0, -9.8)
 NO_LIMIT = 1e16
-WORLD = "world"
+WORLD, MODEL = "world", "__model__"
 SEEN_ONLY = ("sensor", "light", "audio_sink", "audio_source", "projector", "battery", "particle_emitter")
 SETTINGS = (
     "pose",
@@ -81,8 +81,9 @@ class _Model:
             names = [child.name for child in node.all("link", "joint", "frame")]
             twice = next(child for child in node.all("link", "joint", "frame") if names.count(child.name) > 1)
             raise twice.where.error("the name is there twice; give each link, joint and frame a name of its own")
-        self.found: dict[str, Pose] = {WORLD: np.eye(4), "__model__": self.own, "": self.own}
-        self.links = {link.name for link in node.all("link")}
+        self.found: dict[str, Pose] = {WORLD: np.eye(4), MODEL: self.own, "": self.own}
+        self.links = [link.name for link in node.all("link")]
+        self.canonical = node.attributes.get("canonical_link", "") or next(iter(self.links), "")
 
     def read(self) -> None:
         """Read links, then joints."""
@@ -132,9 +133,7 @@ class _Model:
 
     def _reference(self, node: Node) -> str:
         """The name of the frame that the pose of a link, joint or frame is in."""
-        given = node.find("pose")
-        named = "" if given is None else given.attributes.get("relative_to", given.attributes.get("frame", ""))
-        if named:
+        if named := _relative_to(node):
             return named
         if node.tag == "joint":
             return self._body(node, "child")
@@ -173,9 +172,8 @@ class _Model:
     def _visual(self, link: Node, node: Node) -> None:
         """A shape that is only seen; what is not kept of it is noted."""
         try:
-            given, at = node.find("pose"), self._raw_pose(node)
-            named = "" if given is None else given.attributes.get("relative_to", given.attributes.get("frame", ""))
-            if named:
+            at = self._raw_pose(node)
+            if named := _relative_to(node):
                 at = relative(self.pose_of(named, node) @ at, self.pose_of(link.name))
             material = node.find("material")
             colours = [] if material is None else material.all("diffuse", "ambient")
@@ -187,7 +185,10 @@ class _Model:
             self.draft.leave_out(node.where, "visual", str(error), False)
 
     def _body(self, node: Node, end: str) -> str:
-        """The link at one end of a joint, "world" for the ground; ends may be frames."""
+        """The link at one end of a joint, "world" for the ground.
+
+        An end may be a frame; a frame that is attached to the model is on its canonical link.
+        """
         given = node.child(end)
         named = (given.text or "").strip() or given.attributes.get("link", "")
         seen = []
@@ -195,7 +196,9 @@ class _Model:
             if named in seen:
                 raise self.nodes[named].where.error("it is attached to itself; attach it to a link")
             seen.append(named)
-            named = self.nodes[named].attributes.get("attached_to", "") or min(self.links)
+            named = self.nodes[named].attributes.get("attached_to", "") or MODEL
+        if named == MODEL:
+            named = self.canonical
         if named != WORLD and named not in self.links:
             raise given.where.error(f"{end} is {named!r}, which is no link of the model; known: {self._known()}")
         return named
@@ -257,7 +260,7 @@ class _Model:
             raise axis.where.error("<xyz> is 0 0 0; give a direction")
         named = "" if given is None else given.attributes.get("expressed_in", "")
         if (axis.content("use_parent_model_frame") or "0") in ("1", "true") or (self.version < 1.5 and not named):
-            named = "__model__"
+            named = MODEL
         if not named:
             return direction
         return relative(self.pose_of(named, axis), frame)[:3, :3] @ direction
@@ -318,6 +321,12 @@ class _Model:
         self.draft.constraint(
             Coupling, name, mimic.where, coefficients={terms[1]: 1.0, terms[0]: -factor}, offset=offset
         )
+
+
+def _relative_to(node: Node) -> str:
+    """The frame that the <pose> of an element names, which older versions call `frame`; "" for none."""
+    given = node.find("pose")
+    return "" if given is None else given.attributes.get("relative_to", given.attributes.get("frame", ""))
 
 
 def _term(name, kind, index):
