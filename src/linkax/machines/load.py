@@ -7,10 +7,11 @@ from typing import Literal
 
 from linkax.machines.draft import Draft
 from linkax.machines.machine import Machine
-from linkax.machines.mjcf import read_mjcf
+from linkax.machines.mjcf.read import read_mjcf
 from linkax.machines.sdf import read_sdf
 from linkax.machines.urdf import close_by_yaml, read_urdf
-from linkax.machines.usd import SUFFIXES, read_usd
+from linkax.machines.usd.files import SUFFIXES
+from linkax.machines.usd.read import read_usd
 from linkax.machines.xml import Node, read_xml
 from linkax.model.numbers import listed, one_of, require_bool
 
