@@ -51,8 +51,8 @@ from linkax.machines.load import load as load  # noqa: E402
 from linkax.machines.machine import LeftOut as LeftOut  # noqa: E402
 from linkax.machines.machine import Machine as Machine  # noqa: E402
 from linkax.machines.machine import Start as Start  # noqa: E402
-from linkax.machines.write_mjcf import mujoco_trajectory as mujoco_trajectory  # noqa: E402
-from linkax.machines.write_mjcf import to_mjcf as to_mjcf  # noqa: E402
+from linkax.machines.write_mjcf.coordinates import mujoco_trajectory as mujoco_trajectory  # noqa: E402
+from linkax.machines.write_mjcf.write import to_mjcf as to_mjcf  # noqa: E402
 from linkax.machines.xml import MachineFileError as MachineFileError  # noqa: E402
 from linkax.model.attached import Attached as Attached  # noqa: E402
 from linkax.model.attached import Moving as Moving  # noqa: E402
