@@ -149,6 +149,47 @@ def test_two_connects_between_the_same_bodies_are_a_hinge(tmp_path):
     )
 
 
+STRAIGHT = """<mujoco><worldbody><site name="wall" pos="0 0 2"/><site name="floor"/>
+  <body name="arm" pos="1 0 0"><joint axis="0 1 0"/><geom size="0.1" contype="0" conaffinity="0"/>
+    <site name="tip" pos="0 0 2"/></body></worldbody>
+  <tendon>{tendons}</tendon>{more}</mujoco>"""
+TENDON = '<spatial name="{name}" {numbers}><site site="{first}"/><site site="tip"/></spatial>'
+
+
+def straight(path, more="", **tendons):
+    """A machine with straight tendons from the wall to the tip of its arm, 1 m away as drawn, by their numbers."""
+    text = "".join(TENDON.format(name=name, numbers=numbers, first="wall") for name, numbers in tendons.items())
+    path.write_text(STRAIGHT.format(tendons=text, more=more))
+    return lx.load(path)
+
+
+def test_straight_tendons_are_springs_dampers_and_rods(tmp_path):
+    held = '<equality><tendon name="rod" tendon1="{}" polycoef="0.25 1 0 0 0"/></equality>'.format
+    numbers = {"soft": 'stiffness="3" damping="2" springlength="0.4"', "drawn": 'stiffness="5"', "bare": ""}
+    machine = straight(tmp_path / "straight.xml", held("bare"), **numbers)
+    ends = {"first": [0.0, 0.0, 2.0], "second": [0.0, 0.0, 2.0]}
+    params = lambda name: {key: np.array(entry).tolist() for key, entry in machine.params["forces"][name].items()}
+    assert params("soft.spring") == {**ends, "stiffness": 3.0, "free_length": 0.4}
+    assert params("soft.damper") == {**ends, "damping": 2.0}
+    assert params("drawn.spring") == {**ends, "stiffness": 5.0, "free_length": 1.0}
+    (rod,) = (joint for joint in machine.joints if joint.kind is lx.Distance)
+    assert (rod.name, rod.params["length"], rod.arguments["parent"].body) == ("rod", 1.25, "ground")
+    assert [part.name for part in machine.forces] == ["gravity", "soft.spring", "soft.damper", "drawn.spring"]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "more", "message"),
+    [
+        ('stiffness="3" springlength="0.2 0.4"', "", "a spring with a range of lengths without force"),
+        ('range="0 2"', "", "range, dry friction or armature"),
+        ("", '<equality><tendon tendon1="line" tendon2="other"/></equality>', "a spatial tendon"),
+    ],
+)
+def test_other_spatial_tendons_are_not_dropped_in_silence(tmp_path, numbers, more, message):
+    with pytest.raises(lx.MachineFileError, match=message):
+        straight(tmp_path / "line.xml", more, line=numbers, other="")
+
+
 @pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")
 @pytest.mark.parametrize(
     ("name", "loops", "freedoms", "redundant"), [("robotiq_2f85_v2", 2, 3, 2), ("xarm7_gripper", 2, 1, 2)]

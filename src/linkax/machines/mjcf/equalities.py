@@ -1,4 +1,4 @@
-"""Equalities of MJCF: joints that close loops, and couplings of coordinates."""
+"""Equalities of MJCF: joints that close loops, rods, and couplings of coordinates."""
 
 from collections import defaultdict
 from typing import NamedTuple
@@ -8,17 +8,19 @@ from jaxtyping import Float
 
 from linkax.machines.draft import Draft
 from linkax.machines.mjcf.compiled import Compiled
-from linkax.machines.mjcf.tendons import transmission
+from linkax.machines.mjcf.tendons import points_of, transmission
 from linkax.machines.parts import Place
 from linkax.machines.poses import exact, from_quaternion, pose, relative
 from linkax.machines.xml import Where
 from linkax.model.constraints.constraint import Coupling
 from linkax.model.constraints.polynomial_coupling import PolynomialCoupling
+from linkax.model.joints.distance import Distance
 from linkax.model.joints.fixed import Fixed
 from linkax.model.joints.revolute import Revolute
 from linkax.model.joints.spherical import Spherical
 
 SHORTEST = 1e-9  # apart from each other, two points of a pair of connects make an axis [m]
+MOST_COEFFICIENTS = 5  # of polynomials of MuJoCo
 
 
 class _Connect(NamedTuple):
@@ -31,7 +33,7 @@ class _Connect(NamedTuple):
 
 
 def read_equalities(compiled: Compiled) -> None:
-    """Read joints that close loops, and couplings."""
+    """Read joints that close loops, rods, and couplings."""
     model, draft, kinds = compiled.model, compiled.draft, compiled.mujoco.mjtEq
     names = compiled.names("equality", [_between(compiled, index) for index in range(model.neq)])
     pairs = defaultdict[tuple[str, str], list[_Connect]](list)
@@ -46,8 +48,10 @@ def read_equalities(compiled: Compiled) -> None:
             else:
                 holds_turns = model.eq_data[index][10] != 0.0  # torquescale
                 draft.joint_at(Fixed if holds_turns else Spherical, name, first, second, where, cut=True)
-        elif kind in (kinds.mjEQ_JOINT, kinds.mjEQ_TENDON):
-            _coupling(compiled, index, name, where, kind == kinds.mjEQ_TENDON)
+        elif kind == kinds.mjEQ_JOINT:
+            _of_joints(compiled, index, name, where)
+        elif kind == kinds.mjEQ_TENDON:
+            _of_tendons(compiled, index, name, where)
         else:
             draft.leave_out(where, "equality", "an equality that is no connect, weld, joint or tendon")
     for connects in pairs.values():
@@ -104,16 +108,32 @@ def _turn_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"])
     return exact(Rotation.from_rotvec(across * (angle / size)).as_matrix()) if size else np.eye(3)
 
 
-def _coupling(compiled: Compiled, index: int, name: str, where: Where, of_tendons: bool) -> None:
-    """y = a₀ + a₁ x + … of coordinates, or lengths, measured from where the machine is drawn."""
-    model, coefficients = compiled.model, np.array(compiled.model.eq_data[index][:5])
-    objects = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
-    if of_tendons:
-        follower, leader = (transmission(compiled, tendon, where) if tendon >= 0 else {} for tendon in objects)
-    else:
-        follower, leader = ({compiled.joint_names[joint]: 1.0} if joint >= 0 else {} for joint in objects)
-    if follower is None or leader is None:
+def _of_joints(compiled: Compiled, index: int, name: str, where: Where) -> None:
+    """Couple one coordinate to another one, or hold it."""
+    objects = int(compiled.model.eq_obj1id[index]), int(compiled.model.eq_obj2id[index])
+    follower, leader = ({compiled.joint_names[joint]: 1.0} if joint >= 0 else {} for joint in objects)
+    _couple(compiled, index, name, where, follower, leader)
+
+
+def _of_tendons(compiled: Compiled, index: int, name: str, where: Where) -> None:
+    """Hold the length of a straight tendon, as a rod does, or couple linear combinations of coordinates."""
+    model, objects = compiled.model, (int(compiled.model.eq_obj1id[index]), int(compiled.model.eq_obj2id[index]))
+    constant, *others = map(float, model.eq_data[index][:MOST_COEFFICIENTS])
+    points = points_of(compiled, objects[0])
+    if points and (objects[1] < 0 or not any(others)):
+        length = float(model.tendon_length0[objects[0]]) + constant
+        compiled.draft.joint_at(Distance, name, *points, where, length=length)
         return
+    follower, leader = (transmission(compiled, tendon, where) if tendon >= 0 else {} for tendon in objects)
+    if follower is not None and leader is not None:
+        _couple(compiled, index, name, where, follower, leader)
+
+
+def _couple(
+    compiled: Compiled, index: int, name: str, where: Where, follower: dict[str, float], leader: dict[str, float]
+) -> None:
+    """y = a₀ + a₁ x + … of coordinates, or lengths, measured from where the machine is drawn."""
+    coefficients = np.array(compiled.model.eq_data[index][:MOST_COEFFICIENTS])
     if np.any(coefficients[2:]) and leader:
         arguments = {"joint": follower, "of": leader, "coefficients": coefficients}
         compiled.draft.constraint(PolynomialCoupling, name, where, **arguments)
