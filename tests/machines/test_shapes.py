@@ -155,6 +155,40 @@ def test_a_mesh_of_mjcf_is_where_mujoco_has_it(asset, tmp_path, monkeypatch):
     np.testing.assert_allclose(order(found), order(expected), atol=1e-6)  # MuJoCo keeps single precision
 
 
+def test_shapes_come_back_from_mjcf_and_weigh_nothing(tmp_path):
+    tetrahedron(tmp_path / "part.stl")
+    meshes = [lx.Shape("mesh", scale, *AT[:1], TURN, tmp_path / "part.stl") for scale in ([0.1, -0.2, 0.3], [1, 1, 1])]
+    shapes = [
+        lx.Shape("box", [1.0, 2.0, 3.0], AT[0], TURN, colour=GREEN), lx.Shape("sphere", 0.5),
+        lx.Shape("cylinder", [0.5, 2.0], rotation=TURN), lx.Shape("capsule", [0.5, 2.0]), *meshes, meshes[0],
+        lx.Shape("ellipsoid", [1.0, 2.0, 3.0], AT[0]),
+    ]  # fmt: skip
+    arm, bare = lx.RigidBody("arm", 1.0, inertia=[0.1, 0.2, 0.15], shape=shapes), lx.rod("bare", 1.0, 2.0)
+    joints = [lx.Revolute("hinge", lx.GROUND, arm, axis="y"), lx.Revolute("pin", arm, bare.at("base"), axis="y")]
+    mechanism = lx.Mechanism([arm, bare], joints)
+    text = lx.to_mjcf(mechanism, tmp_path / "drawn.xml")
+    model = mujoco.MjModel.from_xml_string(text)
+    assert (model.nmesh, model.body_mass.tolist(), model.body_inertia[1].tolist()) == (2, [0, 1, 2], [0.1, 0.2, 0.15])
+    found = lx.load(tmp_path / "drawn.xml").shapes
+    assert [*found] == ["arm"]
+    for shape, again in zip(shapes, found["arm"], strict=True):
+        assert (again.kind, again.mesh, again.colour) == (shape.kind, shape.mesh, shape.colour)
+        np.testing.assert_allclose(again.size, shape.size, rtol=1e-15)
+        np.testing.assert_allclose(again.pose, shape.pose, atol=1e-12)
+    assert lx.to_mjcf(mechanism, ignore=["Shape"]).count("geom") == 0
+
+
+def test_meshes_that_mujoco_does_not_read_are_told_and_left_out(tmp_path):
+    tetrahedron(tmp_path / "ascii.stl", "stl_ascii")
+    (tmp_path / "part.dae").touch()
+    paths = [tmp_path / name for name in ("ascii.stl", "part.dae", "absent.obj")]
+    arm = lx.RigidBody("arm", 1.0, inertia=[0.1, 0.1, 0.1], shape=[lx.Shape("mesh", mesh=path) for path in paths])
+    mechanism = lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm, axis="y")])
+    with pytest.warns(UserWarning, match=r"not in the MJCF: '.*ascii.stl' is no binary STL .*; 2 more"):
+        text = lx.to_mjcf(mechanism)
+    assert mujoco.MjModel.from_xml_string(text).ngeom == 0
+
+
 def unpacked(view, name):
     (packed,) = re.findall(rf'id="{name}">([^<]*)<', view.html)
     return gzip.decompress(base64.b64decode(packed))

@@ -15,9 +15,11 @@ from linkax.machines.write_mjcf.forces import write_forces
 from linkax.machines.write_mjcf.loops import write_cut
 from linkax.machines.write_mjcf.model import Model, add, words
 from linkax.machines.write_mjcf.pieces import check_tree
+from linkax.machines.write_mjcf.shapes import write_shapes
 from linkax.model.forces.force import Gravity
 from linkax.model.mechanism import Mechanism
 from linkax.model.numbers import listed
+from linkax.model.shapes import Shape
 from linkax.simulation.start.state import State
 
 
@@ -48,7 +50,11 @@ def to_mjcf(
     Of forces MuJoCo gets `Gravity`, `JointSpring`, `JointDamper`, `JointInertia`, `Spring`, `Damper`, and as actuators
     `JointTorque` and `AffineActuator`, whose constant control is in the bias: MuJoCo's control is added to it. It has
     laws of its own for `JointFriction`, dry friction without a scale, and for `JointLimit`, a stop without a contact
-    law. There are no shapes, and contact is off.
+    law.
+
+    Shapes of bodies, `RigidBody(shape=[lx.Shape(...)])`, become geoms without mass, which MuJoCo's viewer shows, and
+    contact is off. Meshes are named by the whole path of their file, a binary STL or OBJ; a warning tells of others,
+    and of those that are not there.
 
     Numbers have all digits. Where a body has no mass, or no inertia about an axis, it gets 2e-15 kg or kg m², since
     MuJoCo refuses zero; the smallest moment of a thin or flat body grows by 1e-12 of the largest.
@@ -58,7 +64,7 @@ def to_mjcf(
     - `path`: of the file, which is written whole; None for the text alone.
     - `state`: a `linkax.State` for the keyframe "start".
     - `ignore`: elements to leave out, by their name or the name of their class, such as ["Drive"]; the motion then is
-      another one.
+      another one. "Shape" leaves out all shapes.
 
     **Returns:** the text.
 
@@ -91,6 +97,8 @@ def _model(mechanism: Mechanism, ignored: set[str]) -> Model:
     gravities = [np.asarray(force.acceleration) for _, force in forces if isinstance(force, Gravity)]
     model = Model(mechanism, sum(gravities, np.zeros(3)))
     write_bodies(model)
+    if Shape.__name__ not in ignored:
+        write_shapes(model)
     for joint in mechanism.joints[mechanism.topology.num_bodies :]:
         if not ignores(joint.name, joint):
             write_cut(model, joint)
