@@ -149,6 +149,47 @@ def test_two_connects_between_the_same_bodies_are_a_hinge(tmp_path):
     )
 
 
+DRIVEN = """<mujoco><worldbody><body name="arm"><joint name="pin" axis="0 1 0" {joint}/>
+    <geom size="0.1" contype="0" conaffinity="0"/></body></worldbody>
+  <tendon><fixed name="belt" {tendon}><joint joint="pin" coef="0.5"/></fixed></tendon>
+  <actuator>{actuators}</actuator></mujoco>"""
+
+
+def driven(path, joint="", tendon="", actuators=""):
+    path.write_text(DRIVEN.format(joint=joint, tendon=tendon, actuators=actuators))
+    return lx.load(path)
+
+
+def motor(name, on):
+    return f'<general name="{name}" gear="-2" forcerange="-1 2" {on}/>'
+
+
+@pytest.mark.parametrize(("on", "target"), [("joint", "pin"), ("tendon", "belt")])
+def test_an_actuator_keeps_the_range_of_what_it_acts_on(tmp_path, on, target):
+    """F is from −1 N m to 2 N m, and −2 F from −3 N m to 5 N m."""
+    given = {on: 'actuatorfrcrange="-3 5"', "actuators": motor("motor", f'{on}="{target}"')}
+    machine = driven(tmp_path / "driven.xml", **given)
+    assert machine.params["forces"]["motor"]["force_range"].tolist() == [-1.0, 1.5]
+
+
+LIMITED = {"joint": 'actuatorfrcrange="-3 5"'}
+TWO = motor("first", 'joint="pin"') + motor("second", 'joint="pin"')
+NEWER = [
+    ({"actuators": motor("motor", 'joint="pin" damping="3"')}, "its own damping"),
+    ({"actuators": motor("motor", 'joint="pin" armature="3"')}, "its own armature"),
+    (LIMITED | {"actuators": TWO}, "the range of the force on its joint, on which others act"),
+    (LIMITED | {"actuators": motor("motor", 'tendon="belt"')}, "the range of the force on a joint of its tendon"),
+    ({"joint": 'stiffness="2" springyield="0.1"'}, "nonlinear terms, jnt_springyield"),
+    ({"tendon": 'stiffness="2 1"'}, "nonlinear terms, tendon_stiffnesspoly"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), NEWER)
+def test_what_newer_versions_of_mujoco_have_is_not_dropped_in_silence(tmp_path, given, message):
+    with pytest.raises(lx.MachineFileError, match=message):
+        driven(tmp_path / "driven.xml", **given)
+
+
 STRAIGHT = """<mujoco><worldbody><site name="wall" pos="0 0 2"/><site name="floor"/>
   <body name="arm" pos="1 0 0"><joint axis="0 1 0"/><geom size="0.1" contype="0" conaffinity="0"/>
     <site name="tip" pos="0 0 2"/></body></worldbody>

@@ -9,38 +9,75 @@ from linkax.machines.mjcf.tendons import transmission
 from linkax.machines.xml import Where
 from linkax.model.forces.affine_actuator import AffineActuator
 
+OWN = ("damping", "dampingpoly", "armature", "delay")  # of an actuator, in newer versions of MuJoCo
+
 
 def read_actuators(compiled: Compiled) -> None:
     """Read all actuators, or note what they are."""
-    draft = compiled.draft
-    for index, name in enumerate(compiled.names("actuator")):
+    model, draft = compiled.model, compiled.draft
+    targets = [_target(compiled, index) for index in range(model.nu)]
+    for index, (name, target) in enumerate(zip(compiled.names("actuator"), targets, strict=True)):
         where = compiled.where("actuator", index)
         if draft.ignores("actuator", where, "the actuator"):
             continue
-        on_tendon, terms = _terms(compiled, index, where)
+        terms = _terms(compiled, index, target, where)
         law = _law(compiled, index, terms or {})
         if terms and law is not None:
+            for own in OWN:
+                if np.any(getattr(model, f"actuator_{own}", np.zeros(model.nu))[index]):
+                    draft.leave_out(where, "actuator", f"its own {own}")
+            law |= _range(compiled, index, target, targets.count(target) == 1, [*terms], where)
             draft.force(AffineActuator, name, where, transmission=terms, control=0.0, **law)
-        elif terms is not None or not on_tendon:
+        elif terms is not None or target[0] != "tendon":
             reason = "an actuator that is not affine, has a state, or acts on no hinge, slide or fixed tendon"
             draft.leave_out(where, "actuator", reason)
 
 
-def _terms(compiled: Compiled, index: int, where: Where) -> tuple[bool, dict[str, float] | None]:
-    """Whether it acts on a tendon, and joints with their factors; None on another thing, which a tendon notes."""
-    model, kinds = compiled.model, compiled.mujoco.mjtTrn
-    on, target = kinds(int(model.actuator_trntype[index])), int(model.actuator_trnid[index][0])
+def _target(compiled: Compiled, index: int) -> tuple[str, int]:
+    """What an actuator acts on, "joint", "tendon" or another thing, and its index."""
+    kind = compiled.mujoco.mjtTrn(int(compiled.model.actuator_trntype[index])).name.removeprefix("mjTRN_").lower()
+    return kind.removesuffix("inparent"), int(compiled.model.actuator_trnid[index][0])
+
+
+def _terms(compiled: Compiled, index: int, target: tuple[str, int], where: Where) -> dict[str, float] | None:
+    """Joints with their factors; None where it acts on another thing, which a tendon notes."""
+    kind, of = target
     terms: dict[str, float] | None = None
-    if on == kinds.mjTRN_TENDON:
-        terms = transmission(compiled, target, where)
-    elif on in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT) and compiled.joint_kinds[target] in ("hinge", "slide"):
-        terms = {compiled.joint_names[target]: 1.0}
-    gear = float(model.actuator_gear[index][0])
-    return on == kinds.mjTRN_TENDON, terms and {joint: gear * factor for joint, factor in terms.items()}
+    if kind == "tendon":
+        terms = transmission(compiled, of, where)
+    elif kind == "joint" and compiled.joint_kinds[of] in ("hinge", "slide"):
+        terms = {compiled.joint_names[of]: 1.0}
+    gear = float(compiled.model.actuator_gear[index][0])
+    return terms and {joint: gear * factor for joint, factor in terms.items()}
+
+
+def _range(
+    compiled: Compiled, index: int, target: tuple[str, int], alone: bool, joints: list[str], where: Where
+) -> dict[str, Any]:
+    """The range of the force: its own, and that of its joint or tendon where it acts on that alone."""
+    model, draft, (kind, of) = compiled.model, compiled.draft, target
+    gear, ranges = float(model.actuator_gear[index][0]), []
+    if model.actuator_forcelimited[index]:
+        ranges.append(np.array(model.actuator_forcerange[index]))
+    limited, given = (
+        (model.jnt_actfrclimited, model.jnt_actfrcrange)
+        if kind == "joint"
+        else (model.tendon_actfrclimited, model.tendon_actfrcrange)
+    )
+    if limited[of] and gear and alone:
+        ranges.append(np.sort(given[of] / gear))
+    elif limited[of] and gear:
+        draft.leave_out(where, "actuator", f"the range of the force on its {kind}, on which others act, too")
+    if kind == "tendon" and any(model.jnt_actfrclimited[compiled.joint_names.index(joint)] for joint in joints):
+        draft.leave_out(where, "actuator", "the range of the force on a joint of its tendon")
+    if not ranges:
+        return {}
+    lower, upper = np.array(ranges).T
+    return {"force_range": np.array([lower.max(), upper.min()])}
 
 
 def _law(compiled: Compiled, index: int, terms: dict[str, float]) -> dict[str, Any] | None:
-    """Gain, bias and range of the force, for a length that is zero where the file draws it; None where not affine."""
+    """Gain and bias of the force, for a length that is zero where the file draws it; None where not affine."""
     model, gains, biases = compiled.model, compiled.mujoco.mjtGain, compiled.mujoco.mjtBias
     gain_type, bias_type = gains(int(model.actuator_gaintype[index])), biases(int(model.actuator_biastype[index]))
     is_affine = gain_type in (gains.mjGAIN_FIXED, gains.mjGAIN_AFFINE)
@@ -53,10 +90,7 @@ def _law(compiled: Compiled, index: int, terms: dict[str, float]) -> dict[str, A
     )
     from_drawn = lambda prm: np.array([prm[0] + prm[1] * drawn, prm[1], prm[2]])
     gain, bias = model.actuator_gainprm[index], model.actuator_biasprm[index]
-    found: dict[str, Any] = {
+    return {
         "gain": float(gain[0]) if gain_type == gains.mjGAIN_FIXED else from_drawn(gain),
         "bias": np.zeros(3) if bias_type == biases.mjBIAS_NONE else from_drawn(bias),
     }
-    if model.actuator_forcelimited[index]:
-        found["force_range"] = np.array(model.actuator_forcerange[index])
-    return found

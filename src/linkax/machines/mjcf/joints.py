@@ -51,7 +51,7 @@ def _along(compiled: Compiled, index: int, name: str, where: Where, terms: list[
             draft.along(name, name, where, stiffness=stiffness, free=free)
         else:
             draft.leave_out(where, "spring", "a spring along several coordinates")
-    of_newer = {"jnt_stiffnesspoly": index, "dof_dampingpoly": slice(dof, dof + len(terms))}
+    of_newer = {"jnt_stiffnesspoly": index, "jnt_springyield": index, "dof_dampingpoly": slice(dof, dof + len(terms))}
     for field, rows in of_newer.items():
         if hasattr(model, field) and np.any(getattr(model, field)[rows]):
             draft.leave_out(where, "spring", f"nonlinear terms, {field}")

@@ -20,6 +20,9 @@ def read_tendons(compiled: Compiled) -> None:
         damping = float(model.tendon_damping[index]) * compiled.has("DAMPER")
         if model.tendon_limited[index] or model.tendon_frictionloss[index] or model.tendon_armature[index]:
             draft.leave_out(where, "tendon", "range, dry friction or armature of a tendon")
+        for field in ("stiffnesspoly", "dampingpoly", "springyield"):  # of newer versions of MuJoCo
+            if np.any(getattr(model, f"tendon_{field}", np.zeros(model.ntendon))[index]):
+                draft.leave_out(where, "spring", f"nonlinear terms, tendon_{field}")
         if not stiffness and not damping:
             continue
         free, end = map(float, model.tendon_lengthspring[index])
