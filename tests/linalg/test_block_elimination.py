@@ -188,3 +188,10 @@ def test_derivatives_and_batches():
     for transform in (jax.jacfwd, jax.jacrev, lambda f: lambda x: jax.vmap(f)(jnp.array([x, 2.0 * x]))):
         found, expected = (transform(lambda x, way=way: acceleration(x, way))(1.3) for way in (by_fronts, at_once))
         np.testing.assert_allclose(found, expected, atol=1e-11)
+
+
+def test_a_row_that_reads_no_speed_is_in_a_front():
+    """As one that locks what stands still, in the loop of a gripper from a file."""
+    nothing, both_speeds = np.array([], dtype=int), np.array([0, 1])
+    plan = plan_elimination([nothing, both_speeds, nothing], [np.array([0]), np.array([1])], 2)
+    assert sorted(row for rows in plan.rows for row in rows) == [0, 1, 2]

@@ -156,10 +156,10 @@ def _with_few_open(sets, size):
 
 
 def _largest(sets, size):
-    """The sets that are subsets of no other."""
+    """The sets that are subsets of no other; a row that reads no speed has none."""
     containing, found = [set() for _ in range(size)], []
-    for members in sorted(set(sets), key=len, reverse=True):
-        if not members or not set.intersection(*(containing[speed] for speed in members)):
+    for members in sorted({*sets} - {frozenset()}, key=len, reverse=True):
+        if not set.intersection(*(containing[speed] for speed in members)):
             for speed in members:
                 containing[speed].add(len(found))
             found.append(members)
