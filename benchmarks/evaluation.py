@@ -61,22 +61,21 @@ def cost(mechanism: lx.Mechanism, state: lx.State) -> dict:
 
 
 def seconds_of(run):
-    """Of one evaluation, the shortest of several loops over as many as take long enough."""
+    """Of one evaluation: by how much a loop over four times as many takes longer, the shortest of several."""
     count = 1
     jax.block_until_ready(run(count))  # the first call takes longer
-    while True:
-        began = time.perf_counter()
-        jax.block_until_ready(run(count))
-        seconds = time.perf_counter() - began
-        if seconds > LONG_ENOUGH:
-            break
+    while _shortest(run, count, 1) < LONG_ENOUGH:
         count *= 4
+    return (_shortest(run, 4 * count) - _shortest(run, count)) / (3 * count)
+
+
+def _shortest(run, count, repeats=REPEATS):
     times = []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         began = time.perf_counter()
         jax.block_until_ready(run(count))
         times.append(time.perf_counter() - began)
-    return min(times) / count
+    return min(times)
 
 
 def _pinocchio(problem):
