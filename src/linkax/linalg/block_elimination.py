@@ -153,7 +153,7 @@ class SaddlePointInFronts(eqx.Module):
         weight = jnp.concatenate([coupled, own], axis=1)
         a, multipliers = _read(unknowns[:n], table), _read(unknowns[n:], rows)
         force = _times(weight, a) - _times(jnp.swapaxes(blocks.rows, 1, 2), multipliers)
-        along = constant_product(table.ravel() == np.arange(n)[:, None], force.reshape(-1))
+        along = constant_product(self.plan.read_table.ravel() == np.arange(n)[:, None], force.reshape(-1))
         return jnp.concatenate([along, _gathered(_times(blocks.rows, a), rows, m)])
 
 

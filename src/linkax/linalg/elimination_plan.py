@@ -24,11 +24,13 @@ class EliminationPlan:
 
     - `interior`: speeds that each front adds. `separator`: speeds of earlier fronts that it, or a later one, reads.
     - `rows`: of the Jacobian, each in the first front that has all speeds it reads.
+    - `read`: speeds that its rows and the inertias of its interior read; other speeds of the separator pass by.
     """
 
     interior: tuple[tuple[int, ...], ...]
     separator: tuple[tuple[int, ...], ...]
     rows: tuple[tuple[int, ...], ...]
+    read: tuple[tuple[int, ...], ...]
 
     @property
     def work(self) -> float:
@@ -60,6 +62,13 @@ class EliminationPlan:
     def table(self) -> np.ndarray:
         """The speeds that each front reads: separator, then interior, (k, s + p)."""
         return np.concatenate([self.separator_table, self.interior_table], axis=1)
+
+    @cached_property
+    def read_table(self) -> np.ndarray:
+        """`table`, with -1 for speeds that pass by."""
+        return np.array(
+            [np.where(np.isin(own, read), own, -1) for own, read in zip(self.table, self.read, strict=True)]
+        )
 
     @cached_property
     def passed_on(self) -> np.ndarray:
@@ -110,10 +119,16 @@ def plan_elimination(
     found = [_cuts(open_, added, kept) for added in sorted(sizes) for kept in np.unique(open_)]
     cuts = min((each for each in found if each), key=work)
     fronts = list(pairwise(cuts))
+    front_of = np.searchsorted(cuts, place, side="right") - 1
+    read = [set[int]() for _ in fronts]
+    for members in sets:
+        for front in front_of[list(members)]:
+            read[front] |= members
     return EliminationPlan(
         interior=tuple(tuple(sorted(order[start:end].tolist())) for start, end in fronts),
         separator=tuple(tuple(np.flatnonzero((place < start) & (last >= start)).tolist()) for start, _ in fronts),
         rows=tuple(tuple(np.flatnonzero((of_row >= start) & (of_row < end)).tolist()) for start, end in fronts),
+        read=tuple(tuple(sorted(members)) for members in read),
     )
 
 
