@@ -7,7 +7,8 @@ whose equalities are soft, as they are stiffened with shorter steps.
 
 Of the scenes of machines, `pins`: of an excavator and a Delta robot, let go without motors, how far pins that close
 loops are apart at most [m] here, and in MuJoCo as it comes and stiffened; and the largest force at each pin [N].
-`hoberman`: rings of up to 240 struts, their rank, and the time of one evaluation of their equations of motion [µs].
+`hoberman`: rings of up to 480 struts, their rank, the time of one evaluation of their equations of motion [µs], and how
+far from the closed form a motor opens rings of 240 struts, relative to their outer radius.
 
 `python -m benchmarks.machines [PART ...]` prints one JSON object.
 """
@@ -39,7 +40,8 @@ STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1.25e-4)
 STIFF = 2.0  # steps in which MuJoCo's gaps decay
 FALL = 0.3  # of pins [s]
 SOFTNESS = {"default": None, **{f"stiffened, step {step}": step for step in (1e-3, 1e-4)}}
-RINGS = ((6, 1), (12, 1), (12, 2), (24, 2), (24, 3), (24, 5))  # pairs in a ring, rings
+RINGS = ((12, 1), (24, 1), (48, 1), (120, 1), (240, 1), (24, 2), (24, 3), (24, 5))  # pairs in a ring, rings
+OPENED = ((120, 1), (24, 5))  # whose motion is compared, of 240 struts
 
 
 def load(name, *ignore, base=None):
@@ -226,8 +228,8 @@ def open_in_mujoco(text, step):
 
 def rings(pairs, count):
     """Rank and cost of a ring of scissors, or several, as drawn."""
-    changes = {"pairs": pairs, "rings": count, "angle": 1.3 * np.pi / pairs, "motor": 2}
-    mechanism = SCENES["hoberman"].mechanism(SCENES["hoberman"].settings(changes=changes))
+    scene, changes = SCENES["hoberman"], {"pairs": pairs, "rings": count, "angle": 1.3 * np.pi / pairs}
+    mechanism = scene.mechanism(scene.settings(changes=changes | {"motor": 2}))
     topology = mechanism.topology
     state = lx.State(np.zeros(topology.num_coordinates), np.zeros(topology.num_speeds), topology)
     mobility, price = lx.mobility(mechanism, state), cost(mechanism, state)
@@ -240,7 +242,18 @@ def rings(pairs, count):
         "degrees_of_freedom": int(mobility.degrees_of_freedom),
         "us": price["us"],
         "compile_s": price["compile_s"],
-    }
+    } | ({"from_closed_form": opened(scene, changes)} if (pairs, count) in OPENED else {})
+
+
+def opened(scene, changes):
+    """How far inner and outer pins are from the closed form while a motor opens the rings."""
+    settings = scene.settings(changes=changes | {"angle": 0.3, "angle_change": 0.3, "duration": 0.5})
+    mechanism, times = scene.mechanism(settings), np.linspace(0.0, 0.5, 6)
+    start, saveat = scene.initial(mechanism, settings), diffrax.SaveAt(ts=times)
+    solution = lx.simulate(mechanism, start, t1=times[-1], saveat=saveat, accuracy=lx.Accuracy(rtol=1e-10))
+    exact, points = scene.exact(settings, times), scene.points(settings)
+    apart = [np.abs(solution.position(*where) - exact[point]).max() for point, where in points.items()]
+    return max(apart) / np.abs(exact["outer"]).max()
 
 
 PARTS = {
