@@ -9,13 +9,14 @@ before the separator, the open ones. Names and indices only.
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from jaxtyping import Int
 
 PER_FRONT = 2000.0  # multiplications that take as long as what a front costs however small it is
 GROWTH = 1.25  # from one size of fronts to the next that is tried
+MOST_COUNTS = 64  # of open speeds that are tried
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +117,9 @@ def plan_elimination(
         return _work(len(cuts) - 1, open_[cuts[:-1]].max(initial=0), np.diff(cuts).max(initial=0), rows.max(initial=0))
 
     sizes = {int(GROWTH**power) for power in range(1 + int(np.log(max(size, 1)) / np.log(GROWTH)))} | {size}
-    found = [_cuts(open_, added, kept) for added in sorted(sizes) for kept in np.unique(open_)]
+    counts = np.unique(open_)
+    counts = counts[np.linspace(0, len(counts) - 1, min(len(counts), MOST_COUNTS), dtype=int)]
+    found = [_cuts(open_, added, kept) for added, kept in product(sorted(sizes), counts)]
     cuts = min((each for each in found if each), key=work)
     fronts = list(pairwise(cuts))
     front_of = np.searchsorted(cuts, place, side="right") - 1
