@@ -11,6 +11,10 @@ from linkax.linalg.elimination_plan import PER_FRONT, EliminationPlan, plan_elim
 from linkax.model.topology import Topology
 from linkax.xla.arrays import Array
 
+# More rows than speeds are redundant. Chosen front by front, rows that are independent are so by less than those chosen
+# among all: states seem closer to a singular configuration, and limits take their time. Fronts must save this much.
+REDUNDANT = 4.0
+
 
 class Island(NamedTuple):
     """A part of a mechanism that moves independently of the rest: its loop rows and its speeds."""
@@ -47,7 +51,8 @@ def structure_of(topology: Topology) -> Structure:
     if topology.num_rows == 0 or at_once <= PER_FRONT:
         return Structure(islands, None)
     plan = plan_elimination(topology.read_by_rows, topology.coupled_by_inertia, topology.num_speeds)
-    return Structure(islands, plan if plan.work < at_once else None)
+    worth = REDUNDANT if topology.num_rows > topology.num_speeds else 1.0
+    return Structure(islands, plan if worth * plan.work < at_once else None)
 
 
 def _islands(topology):
