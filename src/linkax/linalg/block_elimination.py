@@ -224,7 +224,7 @@ class _Here(NamedTuple):
         normally = jnp.concatenate([-asked @ of_kept, asked], axis=1)
         remaining = jnp.pad(of_loads, ((0, 0), (0, rows))) - jnp.pad(of_normal @ normally, ahead)
         staying = solved @ remaining
-        on = jnp.where(passes[:, None], remaining - metric @ staying, 0.0)[:kept]
+        on = jnp.where(passes[:kept, None], remaining[:kept] - metric[:kept] @ staying, 0.0)
         asks = jnp.pad(onward[:, :kept], ((0, 0), (0, rows))) + moves[:, width - count :] @ normally
         forwards = jnp.concatenate([on, jnp.pad(asks, ahead)])
 
@@ -239,12 +239,13 @@ class _Here(NamedTuple):
         back = jnp.pad(onward[:, :kept].T, others) + of_kept.T @ multipliers - blocks.coupling @ y[kept:]
         backwards = jnp.concatenate([back, y, multipliers])
 
-        condensed = metric - metric @ to_stay
+        passes = passes[:kept]
+        condensed = metric[:kept, :kept] - metric[:kept] @ to_stay[:, :kept]
         both = passes[:, None] & passes[None, :]
         following = _Passed(
-            along=jnp.where(passes, moves, 0.0)[:, :kept],
-            metric=jnp.where(both, condensed, jnp.diag(jnp.where(passes, 0.0, 1.0)))[:kept, :kept],
-            size=jnp.where(passes, size, 1.0)[:kept],
+            along=jnp.where(passes, moves[:, :kept], 0.0),
+            metric=jnp.where(both, condensed, jnp.diag(jnp.where(passes, 0.0, 1.0))),
+            size=jnp.where(passes, size[:kept], 1.0),
         )
         return following, _Eliminated(forwards, backwards, jnp.sum(active), distance, definiteness)
 

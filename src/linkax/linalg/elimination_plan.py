@@ -109,7 +109,7 @@ def plan_elimination(
     last = place.copy()  # of the speeds that are in one set with it
     for members in map(list, sets):
         last[members] = np.maximum(last[members], place[members].max())
-    open_ = np.array([np.sum((place < cut) & (last >= cut)) for cut in range(size + 1)])
+    open_ = np.arange(size + 1) - np.cumsum(np.bincount(last + 1, minlength=size + 1))  # before each place
     of_row = np.array([place[members].max() if len(members) else 0 for members in of_rows], dtype=int)
 
     def work(cuts):
