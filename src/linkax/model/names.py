@@ -1,6 +1,7 @@
 """Names of elements: checked, and found among those that are known."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, TypeVar
 
@@ -45,6 +46,12 @@ def find(name: Any, names: Sequence[str], what: str) -> int:
 
 def _unknown(name, names, what) -> str:
     return f"unknown {what} {name!r}{meant(name, names)}; known: {', '.join(map(repr, names)) or 'none'}"
+
+
+def free_name(stem: str, taken: Collection[str]) -> str:
+    """The stem itself, or with the first number that is free: stem, stem_1, stem_2."""
+    candidates = (f"{stem}_{count}" if count else stem for count in itertools.count())
+    return next(candidate for candidate in candidates if candidate not in taken)
 
 
 def meant(name: Any, names: Iterable[str]) -> str:

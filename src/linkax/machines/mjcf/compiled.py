@@ -1,6 +1,5 @@
 """A model that MuJoCo has compiled, with the names and lines that its file gives the elements."""
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from linkax.machines.draft import Draft
 from linkax.machines.xml import Where
 from linkax.model.bodies import GROUND_NAME
+from linkax.model.names import free_name
 
 
 class Compiled:
@@ -47,8 +47,7 @@ class Compiled:
         for index in range(len(given)):
             name = given[index].name if given[index].name != GROUND_NAME else ""
             stem = kind if instead is None else instead[index]
-            candidates = (stem + (f"_{count}" if count else "") for count in itertools.count())
-            found.append(name or next(candidate for candidate in candidates if candidate not in taken))
+            found.append(name or free_name(stem, taken))
             taken.add(found[-1])
         return found
 

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from linkax.machines.write_mjcf.model import MOST_COEFFICIENTS, Model, polynomial, refused, terms_of
+from linkax.machines.mjcf.equalities import MOST_COEFFICIENTS
+from linkax.machines.write_mjcf.model import Model, polynomial, refused, terms_of
 from linkax.model.constraints.constraint import Coupling
 from linkax.model.constraints.polynomial_coupling import PolynomialCoupling
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.machines.draft import Pose
+from linkax.machines.mjcf.equalities import MOST_COEFFICIENTS
 from linkax.machines.poses import pose, to_quaternion
 from linkax.machines.write_mjcf.pieces import pose_of
 from linkax.model.bodies import Frame
@@ -16,7 +17,6 @@ from linkax.model.terms import Combination, Term
 from linkax.model.topology import GROUND_INDEX
 
 Element = ElementTree.Element
-MOST_COEFFICIENTS = 5  # of polynomials of MuJoCo
 
 
 class Model:

@@ -1,11 +1,11 @@
 """Shapes of bodies in a model: geoms without mass and contact, which MuJoCo's viewer shows."""
 
-import itertools
 from pathlib import Path
 
 import numpy as np
 
 from linkax.machines.write_mjcf.model import Model, add, at, words
+from linkax.model.names import free_name
 from linkax.model.shapes import Shape
 from linkax.xla.users_line import warn
 
@@ -52,9 +52,7 @@ def _mesh(model: Model, path: str, scale: str, meshes: dict[tuple[str, str], str
     It is a shell, as MuJoCo refuses other meshes that enclose no volume, though no body has their inertia.
     """
     if (path, scale) not in meshes:
-        stem = Path(path).stem
-        candidates = (f"{stem}_{count}" if count else stem for count in itertools.count())
-        name = next(candidate for candidate in candidates if candidate not in meshes.values())
+        name = free_name(Path(path).stem, {*meshes.values()})
         add(model.section("asset"), "mesh", name=name, file=path, scale=scale, inertia="shell")
         meshes[path, scale] = name
     return meshes[path, scale]
