@@ -19,6 +19,7 @@ import jax
 import numpy as np
 
 import linkax as lx
+from benchmarks.compile_times import least
 from benchmarks.parts import print_parts
 from benchmarks.peers import PEERS
 from benchmarks.problems import PROBLEMS, Problem
@@ -28,7 +29,6 @@ from linkax.simulation.integrate import problem as integrated
 ROWS = (1, 2, 5, 10, 20, 40, 70, 100, 200)
 BODIES = (10, 30, 100, 300, 1000)
 LONG_ENOUGH = 0.05  # seconds, for a loop over evaluations
-REPEATS = 7
 SMALLEST = 1e-30  # keeps a loop from being the same in each pass, and changes nothing
 
 
@@ -64,18 +64,9 @@ def seconds_of(run):
     """Of one evaluation: by how much a loop over four times as many takes longer, the shortest of several."""
     count = 1
     jax.block_until_ready(run(count))  # the first call takes longer
-    while _shortest(run, count, 1) < LONG_ENOUGH:
+    while least(partial(run, count)) < LONG_ENOUGH:
         count *= 4
-    return (_shortest(run, 4 * count) - _shortest(run, count)) / (3 * count)
-
-
-def _shortest(run, count, repeats=REPEATS):
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        jax.block_until_ready(run(count))
-        times.append(time.perf_counter() - began)
-    return min(times)
+    return (least(partial(run, 4 * count)) - least(partial(run, count))) / (3 * count)
 
 
 def _pinocchio(problem):
