@@ -111,6 +111,7 @@ def test_what_runs_once_has_no_part_in_transformations_of_others():
 def _with_limit(monkeypatch, folder, *free):
     """As if the process had so many memory maps left, one after another; the last one stays."""
     left = iter([*free[:-1], *[free[-1]] * 100])
+    monkeypatch.setattr(memory_maps, "_fitting", [0])
     monkeypatch.setattr(memory_maps, "_maps", lambda: memory_maps._limit_of_maps() - next(left))
     monkeypatch.setattr(memory_maps, "LIMIT_OF_MAPS", folder / "limit")
     (folder / "limit").write_text("70000\n")
