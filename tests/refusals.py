@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from unchecked import unchecked
+from annotations import unchecked
 
 import linkax as lx
 

@@ -4,18 +4,12 @@ import ast
 from pathlib import Path
 
 import pytest
+from layers import LAYERS, layer
 
 import linkax
 
 SOURCE = Path(linkax.__file__).parent
 CONTRIBUTING = Path(__file__).parents[1] / "CONTRIBUTING.md"
-# From the lowest to the highest, as CONTRIBUTING says: rooms of a layer as layer.room.
-LAYERS = ["files", "optional", "xla", "tables", "straight_line", "spatial", "model", "linalg", "equations"]
-LAYERS += ["formulations"]
-LAYERS += [f"simulation.{room}" for room in ("start", "integrate", "explain", "read", "simulate")]
-LAYERS += ["analysis"]
-LAYERS += [f"studies.{room}" for room in ("parameters", "laboratory", "fits", "sweeps", "tolerances", "synthesis")]
-LAYERS += ["machines", "scenes", "scenery", "view", "plot", "cli"]
 # Methods that hand on to a higher layer, which they import when they are called.
 HAND_ON = {
     ("linkax.model.mechanism", "linkax.simulation.read.solution"),
@@ -24,9 +18,8 @@ HAND_ON = {
 }
 
 
-def layer(module):
-    _, *parts = module.split(".")
-    return next(i for i in range(len(LAYERS)) if LAYERS[i] in (parts[0], ".".join(parts[:2])))
+def layer_of(module):
+    return layer(*module.split(".")[1:])
 
 
 def imports(path):
@@ -46,7 +39,7 @@ def test_imports_run_one_way(path):
         if (module, imported) in HAND_ON:
             continue
         assert not imported.startswith("linkax_command"), f"{module} imports the command line's reader"
-        assert imported == "linkax" or layer(imported) <= layer(module), (
+        assert imported == "linkax" or layer_of(imported) <= layer_of(module), (
             f"{module} imports {imported}, which is above it"
         )
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
-from unchecked import unchecked
+from annotations import unchecked
 
 import linkax as lx
 from linkax_command import run

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from annotations import unchecked
 from refusals import clear
-from unchecked import unchecked
 
 import linkax as lx
 

@@ -40,7 +40,7 @@ def cache_programs(folder: str | os.PathLike | None = None) -> str:
     **Warns:** once, of a program that took long to compile and cannot be kept. JAX keeps none that calls back to
     Python, as progress meters, `jax.debug.print` and `equinox.error_if` do.
     """
-    path = os.fspath(folder or cast(Any, jax.config).jax_compilation_cache_dir or _users_folder())
+    path = os.fspath(folder or cast(Any, jax.config).jax_compilation_cache_dir or users_folder())
     if "://" not in path:
         writable_folder(Path(path), "give another folder for programs")
     jax.config.update("jax_compilation_cache_dir", path)
@@ -53,7 +53,7 @@ def cache_programs(folder: str | os.PathLike | None = None) -> str:
     return path
 
 
-def _users_folder() -> Path:
+def users_folder() -> Path:
     """The folder for caches of linkax, by the convention of the system."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "linkax" / "Cache"

@@ -1,0 +1,55 @@
+"""Processor time of the tests: what all of them took, and an error for a fast one that takes long."""
+
+import resource
+
+import pytest
+
+LONGEST = 10  # tests that the summary names
+TIME = "processor time [s]"
+BEGIN = pytest.StashKey[float]()
+
+
+def pytest_addoption(parser):
+    parser.addini("most_processor_time", "of a test that is not marked slow [s]", "string", "10")
+
+
+def _used():
+    """Processor time of this process and of those that it has waited for [s]."""
+    of = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(used.ru_utime + used.ru_stime for used in of)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item):
+    item.stash[BEGIN] = _used()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item):
+    result = yield
+    time = _used() - item.stash[BEGIN]
+    item.user_properties.append((TIME, time))
+    most = float(item.config.getini("most_processor_time"))
+    if time > most and not item.get_closest_marker("slow"):
+        pytest.fail(
+            f"took {time:.1f} s of processor time, and a test may take {most:g}: share a mechanism of "
+            "tests/mechanisms.py with others, so that less is compiled, or mark it slow",
+            pytrace=False,
+        )
+    return result
+
+
+def pytest_terminal_summary(terminalreporter):
+    times = {
+        report.nodeid: dict(report.user_properties)[TIME]
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        if TIME in dict(getattr(report, "user_properties", ()))
+    }
+    if not times:
+        return
+    terminalreporter.section("processor time")
+    terminalreporter.line(f"{sum(times.values()):.0f} s in {len(times)} tests; the longest:")
+    for nodeid in sorted(times, key=times.get, reverse=True)[:LONGEST]:
+        terminalreporter.line(f"{times[nodeid]:6.1f} s {nodeid}")
