@@ -1,4 +1,9 @@
-"""A pool of mechanisms for laws that hold for all of them."""
+"""Mechanisms of the tests, whose names and numbers are traced alike wherever they are used, and so share programs.
+
+A pendulum, a crank-slider, a four-bar, a coupler between balls, a Sarrus linkage; Bricard's, the spatial four-link,
+rows of four-bars and cranes are scenes (`known_answers.start`). `POOL` has random ones, with all joints, beams, forces
+and constraints, for laws that hold for all of them.
+"""
 
 import copy
 
@@ -9,19 +14,49 @@ import numpy as np
 import linkax as lx
 
 
-def crank_slider(cut=None, order=1, offset=(0.0, 0.0, 0.0), rod=1.3):
+def down(gravity):
+    """Gravity along −y [m/s²]."""
+    return lx.Gravity([0.0, -gravity, 0.0])
+
+
+def pendulum(length=1.0, mass=1.0, gravity=9.81, forces=(), constraints=()):
+    """A rod `arm` on a `hinge` about z, which points along x at zero."""
+    arm = lx.rod("arm", length, mass)
+    hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
+    return lx.Mechanism([arm], [hinge], [down(gravity), *forces], constraints)
+
+
+def crank_slider(
+    cut=None, order=1, offset=(0.0, 0.0, 0.0), crank=1.0, rod=1.3, masses=(1.0, 2.0, 0.5), forces=(), constraints=()
+):
     """The planar crank-slider; `order` -1 declares its joints the other way round."""
     offset = np.array(offset)
-    crank, link = lx.rod("crank", length=1.0, mass=1.0), lx.rod("rod", length=rod, mass=2.0)
-    slider = lx.point_mass("slider", mass=0.5)
+    bar, link = lx.rod("crank", crank, masses[0]), lx.rod("rod", rod, masses[1])
+    slider = lx.point_mass("slider", masses[2])
     options = lambda name: {"cut": True} if name == cut else {}
     joints = [
-        lx.Revolute("bearing", lx.GROUND.at(offset), crank.at("base"), axis="z", **options("bearing")),
-        lx.Revolute("crank_pin", crank.at("tip"), link.at("base"), axis="z", **options("crank_pin")),
+        lx.Revolute("bearing", lx.GROUND.at(offset), bar.at("base"), axis="z", **options("bearing")),
+        lx.Revolute("crank_pin", bar.at("tip"), link.at("base"), axis="z", **options("crank_pin")),
         lx.Revolute("wrist_pin", link.at("tip"), slider, axis="z", **options("wrist_pin")),
         lx.Prismatic("guide", lx.GROUND.at(offset), slider, axis="x", **options("guide")),
     ]
-    return lx.Mechanism([crank, link, slider], joints[::order], [lx.Gravity([0.0, -9.81, 0.0])])
+    return lx.Mechanism([bar, link, slider], joints[::order], [down(9.81), *forces], constraints)
+
+
+def four_bar(crank=0.4, coupler=1.0, rocker=0.9, ground=1.0, cut=None, forces=(), constraints=()):
+    """The planar four-bar, all rods of one kilogram, along x at zero."""
+    rods = [lx.rod("crank", crank, 1.0), lx.rod("coupler", coupler, 1.0), lx.rod("rocker", rocker, 1.0)]
+    first, middle, last = rods
+    options = lambda name: {"cut": True} if name == cut else {}
+    joints = [
+        lx.Revolute("crank_bearing", lx.GROUND, first.at("base"), axis="z", **options("crank_bearing")),
+        lx.Revolute("crank_pin", first.at("tip"), middle.at("base"), axis="z", **options("crank_pin")),
+        lx.Revolute("rocker_pin", middle.at("tip"), last.at("tip"), axis="z", **options("rocker_pin")),
+        lx.Revolute(
+            "rocker_bearing", lx.GROUND.at([ground, 0.0, 0.0]), last.at("base"), "z", **options("rocker_bearing")
+        ),
+    ]
+    return lx.Mechanism(rods, joints, [down(9.81), *forces], constraints)
 
 
 def coupler_between_balls():

@@ -44,16 +44,6 @@ def test_how_a_run_is_compiled_changes_nothing_but_rounding(as_users_do):
     np.testing.assert_allclose(one["speeds"], other["speeds"], rtol=1e-10)
 
 
-def test_assembly_may_be_part_of_a_program_with_callbacks(as_users_do):
-    """Errors of Equinox call back to Python, which XLA finds no way to from some programs with loops."""
-    apart, together = as_users_do["assembled_inside"]["ends"]
-    np.testing.assert_allclose(together, apart, rtol=1e-10)
-
-
-def test_the_loop_over_steps_is_one_kernel(as_users_do):
-    assert as_users_do["assembled_inside"]["of_run"] == [False]
-
-
 @pytest.mark.slow
 def test_slow_loops_are_told_unless_asked_for():
     """Where linkax is imported too late for its flags, all is computed on arrays."""

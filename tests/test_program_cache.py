@@ -80,20 +80,33 @@ def ran(*arguments, program=PENDULUM, **environment):
     return json.loads(found.stdout.splitlines()[-1]), found.stderr
 
 
-def test_a_second_process_traces_and_compiles_nothing(tmp_path):
-    """With functions of a user, which may hash otherwise there; another number in one is another program."""
-    (force, programs, asked, found, folder), _ = ran(tmp_path)
-    assert (programs, found, folder) == (["_check_start", "_closed", "_integrate", "_of_times"], 0, str(tmp_path))
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """A folder, and what the first process with it prints."""
+    folder = tmp_path_factory.mktemp("programs")
+    return folder, ran(folder)[0]
+
+
+def test_a_second_process_traces_and_compiles_nothing(first):
+    """With functions of a user, which may hash otherwise there."""
+    path, (force, programs, asked, found, folder) = first
+    assert (programs, found, folder) == (["_check_start", "_closed", "_integrate", "_of_times"], 0, str(path))
     assert asked > 3
-    again, told = ran(JAX_COMPILATION_CACHE_DIR=str(tmp_path), PYTHONHASHSEED="1")
-    assert (again[0], again[1], again[4]) == (force, [], str(tmp_path))
+    again, told = ran(JAX_COMPILATION_CACHE_DIR=str(path), PYTHONHASHSEED="1")
+    assert (again[0], again[1], again[4]) == (force, [], str(path))
     assert again[2] == again[3]
     assert "compiled again" not in told
-    other, _ = ran(tmp_path, RATE="2.0")
+
+
+@pytest.mark.slow
+def test_another_number_in_a_function_of_a_user_is_another_program(first):
+    path, (force, *_) = first
+    other, _ = ran(path, RATE="2.0")
     assert other[0] != force
     assert "_integrate" in other[1]
 
 
+@pytest.mark.slow
 def test_kept_programs_call_lapack(tmp_path):
     """Which JAX loads where it lowers, as it does not here; and a file that is damaged is none."""
     matrix = np.eye(40) + 0.1 * np.arange(40.0)[:, None]
@@ -241,9 +254,9 @@ def test_equal_things_are_described_alike():
 def test_the_default_folder_is_the_users(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert program_cache._users_folder() == tmp_path / "linkax"
+    assert program_cache.users_folder() == tmp_path / "linkax"
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert program_cache._users_folder() == Path.home() / ".cache" / "linkax"
+    assert program_cache.users_folder() == Path.home() / ".cache" / "linkax"
 
 
 def test_what_cannot_be_kept_is_told():

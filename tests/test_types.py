@@ -60,14 +60,8 @@ state = lx.assemble(mechanism)
 """
 
 
-@pytest.fixture(scope="module")
-def told(tmp_path_factory):
-    """Errors by the file that they are in, with their lines."""
-    folder = tmp_path_factory.mktemp("programs")
-    books = ROOT / "notebooks"
-    paths = [*books.glob("*.ipynb"), *books.glob("gallery/*.ipynb")]
-    notebooks = {path.stem: _code(path) for path in paths}
-    programs = notebooks | {"right": RIGHT, "readme": "\n".join(BLOCKS), "wrong": BEGIN + "\n".join(WRONG)}
+def errors_of(programs, folder):
+    """Errors by the program that they are in, with their lines."""
     for name, text in programs.items():
         (folder / f"{name}.py").write_text(text)
     source = str(ROOT / "src")
@@ -81,6 +75,12 @@ def told(tmp_path_factory):
     return errors
 
 
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    programs = {"right": RIGHT, "readme": "\n".join(BLOCKS), "wrong": BEGIN + "\n".join(WRONG)}
+    return errors_of(programs, tmp_path_factory.mktemp("programs"))
+
+
 def _code(path):
     cells = json.loads(path.read_text())["cells"]
     return "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
@@ -88,6 +88,13 @@ def _code(path):
 
 def test_right_programs_are_let_pass(told):
     assert {name: errors for name, errors in told.items() if errors and name != "wrong"} == {}
+
+
+@pytest.mark.slow
+def test_notebooks_are_let_pass(tmp_path):
+    books = ROOT / "notebooks"
+    notebooks = {path.stem: _code(path) for path in (*books.glob("*.ipynb"), *books.glob("gallery/*.ipynb"))}
+    assert {name: errors for name, errors in errors_of(notebooks, tmp_path).items() if errors} == {}
 
 
 @pytest.mark.parametrize("line", range(len(WRONG)), ids=list(WRONG))

@@ -52,13 +52,22 @@ def test_nothing_is_told_where_nobody_watches(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_what_compiles_for_the_first_time_is_told(watched, capsys):
-    arm = lx.rod("waited_for", 1.0, 1.0)  # a name of its own, so that no other test has compiled it
-    mechanism = lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")])
+def waited_for():
+    """A mechanism with a name of its own, so that no other test has compiled it."""
+    arm = lx.rod("waited_for", 1.0, 1.0)
+    return lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")])
+
+
+def test_an_assembly_that_compiles_for_the_first_time_is_told(watched, capsys):
+    for told in (True, False):
+        lx.assemble(waited_for(), {"hinge": 0.3})
+        assert bool(shown(capsys)) is told
+
+
+def test_a_run_that_compiles_for_the_first_time_is_told(watched, capsys):
+    mechanism, start = waited_for(), lx.State(jnp.array([0.3]), jnp.zeros(1))
     run = lambda t1: lx.simulate(mechanism, start, t1=t1).reaction("hinge").force
     for told in (True, False):
-        start = lx.assemble(mechanism, {"hinge": 0.3})
-        assert bool(shown(capsys)) is told
         run(1.0)
         assert bool(shown(capsys)) is told
     jax.vmap(lambda t1: run(t1))(jnp.ones(2))

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,8 +74,13 @@ def system(name, seed=0, massless=False):
     return System(mass, jacobian, scales, plan, generator.normal(size=size), jacobian @ generator.normal(size=size))
 
 
+# One program each, where operation by operation would be eighty.
+at_once_of = eqx.filter_jit(invert)
+solve = eqx.filter_jit(lambda inverse, force, rate: inverse.apply(force, rate))
+
+
 def both(given, metric, rank_nearby=None):
-    at_once = invert(given.mass if metric == "mass" else None, given.jacobian, given.scales, TOLERANCE)
+    at_once = at_once_of(given.mass if metric == "mass" else None, given.jacobian, given.scales, TOLERANCE)
     found = blocks(given, given.mass, given.jacobian)
     if metric == "identity":
         found = with_identity_metric(found, given.plan, given.scales)
@@ -91,8 +97,8 @@ def product_of(given):
 
 def assert_solved(given, inverse, metric, at_once):
     weight = given.mass if metric == "mass" else np.diag(given.scales**-2)
-    a, multipliers = inverse.apply(given.force, given.rate)
-    expected, others = at_once.apply(given.force, given.rate)
+    a, multipliers = map(np.asarray, solve(inverse, given.force, given.rate))
+    expected, others = map(np.asarray, solve(at_once, given.force, given.rate))
     atol = 1e-13 / float(at_once.distance) ** 2
     np.testing.assert_allclose(a, expected, atol=atol)
     np.testing.assert_allclose(given.jacobian.T @ multipliers, given.jacobian.T @ others, atol=atol)

@@ -1,6 +1,6 @@
 """Known answers, a gradient, a batch and single precision with the settings that users have, which `.ci/run` asks for.
 
-Other tests compile without the flags and kernels that linkax sets, to take less time. `AS_USERS_DO=1` leaves them on.
+Other tests compile in less time, to code that runs slower. `AS_USERS_DO=1` leaves XLA's own settings.
 """
 
 import jax
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from known_answers import PASSING, REDUNDANT, known_slider_end, slider_end, slider_start, start
+from mechanisms import pendulum
 
 import linkax as lx
 from linkax.xla.flags import makes_kernels_of_loops
@@ -54,3 +55,26 @@ def test_single_precision():
     double = lx.simulate(mechanism, state, **options)
     assert single.q.dtype == jnp.float32
     np.testing.assert_allclose(single.q, double.q, atol=1e-2)
+
+
+def end_of_motion(angle):
+    """Of a pendulum, assembled and run."""
+    mechanism = pendulum()
+    return lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": angle}), t1=0.5).q[-1, 0]
+
+
+@pytest.fixture(scope="module")
+def in_one_program():
+    """The same as one program."""
+    return jax.jit(end_of_motion).lower(0.4).compile()
+
+
+def test_assembly_may_be_part_of_a_program_with_callbacks(in_one_program):
+    """Errors of Equinox call back to Python, which XLA finds no way to from some programs with loops."""
+    np.testing.assert_allclose(in_one_program(0.4), end_of_motion(0.4), rtol=1e-10)
+
+
+def test_the_loop_over_steps_is_one_kernel(in_one_program):
+    _, _, entry = in_one_program.as_text().partition("\nENTRY")
+    loops = [line for line in entry.splitlines() if " while(" in line or "xla_cpu_small_call" in line]
+    assert [" while(" in line for line in loops if "diffeqsolve" in line] == [False]

@@ -33,8 +33,14 @@ def assert_same(found, expected):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("seeds", np.array_split(np.arange(SEEDS), 4), ids=lambda seeds: f"{seeds[0]}-{seeds[-1]}")
+RANDOM = [
+    pytest.param(seeds, dtype, id=f"{dtype.__name__}-{seeds[0]}-{seeds[-1]}", marks=[pytest.mark.slow] if later else [])
+    for dtype in (np.float64, np.float32)
+    for later, seeds in enumerate(np.array_split(np.arange(SEEDS), 4))
+]
+
+
+@pytest.mark.parametrize(("seeds", "dtype"), RANDOM)
 def test_random_programs(seeds, dtype):
     for seed in seeds:
         program, given = Program(seed), arguments(seed, dtype)
@@ -51,7 +57,9 @@ def loss(function):
     return of
 
 
-@pytest.mark.parametrize("seed", range(SEEDS, SEEDS + FEW))
+@pytest.mark.parametrize(
+    "seed", [SEEDS, *(pytest.param(SEEDS + later, marks=pytest.mark.slow) for later in range(1, FEW))]
+)
 def test_batches_and_derivatives_of_random_programs(seed):
     program, given = Program(seed), arguments(seed)
     several = [jnp.stack([array, 0.3 - array, 2.0 * array]) for array in given]

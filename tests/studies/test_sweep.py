@@ -56,6 +56,7 @@ def test_members_that_fail_are_marked_and_harm_no_other(whole):
         np.testing.assert_allclose(whole.output["angle"][member], alone["angle"], rtol=0.0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_killed_and_resumed(whole, tmp_path):
     """SIGKILL after a few of sixty chunks: the others alone are run, and all are as they would have been."""
     store, result = tmp_path / "store", tmp_path / "result.npz"
