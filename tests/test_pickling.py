@@ -11,17 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import POOL
+from mechanisms import POOL, pendulum
 
 import linkax as lx
 from linkax.formulations.named import BASES
 
 START = lx.State(jnp.array([0.3]), jnp.array([1.0]))
-
-
-def pendulum():
-    arm = lx.rod("arm", 1.0, 1.0)
-    return lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")], [lx.Gravity([0.0, -9.81, 0.0])])
 
 
 def swing(max_steps=3):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import pendulum
 from refusals import refused
 
 import linkax as lx
@@ -88,9 +89,7 @@ def test_limits_that_nothing_meets_are_told():
 
 def test_experiments_are_their_predictions_over_the_noise():
     """As a function written by hand: without missing samples, and with 95 % of what is told through a robust loss."""
-    arm = lx.rod("arm", 1.0, 1.0)
-    mechanism = lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")])
-    still = lx.Solution.of_state(mechanism, lx.State(np.zeros(1), np.zeros(1)))
+    still = lx.Solution.of_state(pendulum(gravity=0.0), lx.State(np.zeros(1), np.zeros(1)))
     motion = dataclasses.replace(  # that turns evenly
         still, ts=jnp.array([0.0, 9.0]), q=jnp.array([[0.3], [4.8]]), v=jnp.array([[0.5], [0.5]])
     )

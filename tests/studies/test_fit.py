@@ -8,6 +8,7 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
+from mechanisms import pendulum
 
 import linkax as lx
 from linkax.studies.fits import fit_search
@@ -280,12 +281,9 @@ def test_a_minimum_before_an_edge_is_found(best):
 @pytest.mark.slow
 def test_experiments_with_their_own_initial_states():
     """A pendulum's length and damping from three swings, the angles at which they began unknown."""
-    hinge = lambda arm: lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
 
     def angles(params, start):
-        arm = lx.rod("arm", length=params["length"], mass=1.0)
-        forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointDamper("hinge", params["damping"])]
-        mechanism = lx.Mechanism([arm], [hinge(arm)], forces)
+        mechanism = pendulum(params["length"], forces=[lx.JointDamper("hinge", params["damping"])])
         state = lx.State(jnp.reshape(start, 1), jnp.zeros(1))
         return lx.simulate(mechanism, state, t1=2.0).joint("hinge")
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import pendulum
 
 import linkax as lx
 from linkax.studies.laboratory.experiments import Experiments
@@ -17,11 +18,8 @@ NOISE = 0.01
 
 
 def swing(start, saves=41):
-    arm = lx.rod("arm", 1.0, 1.0)
-    hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
-    mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -9.81, 0.0])])
     state = lx.State(jnp.reshape(start, 1), jnp.zeros(1))
-    return lx.simulate(mechanism, state, t1=2.0, saveat=diffrax.SaveAt(ts=np.linspace(0.0, 2.0, saves)))
+    return lx.simulate(pendulum(), state, t1=2.0, saveat=diffrax.SaveAt(ts=np.linspace(0.0, 2.0, saves)))
 
 
 @pytest.fixture(scope="module")

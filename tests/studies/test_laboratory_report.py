@@ -6,6 +6,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import pendulum
 
 import linkax as lx
 from linkax.studies.laboratory.whiteness import Whiteness
@@ -16,9 +17,7 @@ TIMES = np.linspace(0.0, 4.0, 120)
 @pytest.fixture(scope="module")
 def still():
     """A model whose sensors alone have parameters."""
-    arm = lx.rod("arm", 1.0, 1.0)
-    mechanism = lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")])
-    solution = lx.Solution.of_state(mechanism, lx.State(np.array([0.3]), np.array([0.5])))
+    solution = lx.Solution.of_state(pendulum(gravity=0.0), lx.State(np.array([0.3]), np.array([0.5])))
     parts = {"ts": solution.ts, "q": solution.q, "v": solution.v}
     end = {"ts": parts["ts"] + 4.0, "q": parts["q"] + 2.0, "v": parts["v"]}
     joined = {name: jnp.concatenate([parts[name], end[name]]) for name in parts}

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import pendulum
 
 import linkax as lx
 
@@ -14,16 +15,10 @@ FALL = np.array([0.0, -9.81, 0.0])
 MIDDLE = slice(5, -5)
 
 
-def pendulum():
-    """An arm that falls, with a unit across its end."""
-    arm = lx.rod("arm", 0.8, 1.3)
-    return lx.Mechanism([arm], [lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")], [lx.Gravity(FALL)])
-
-
 @pytest.fixture(scope="module")
 def solution():
     saveat = diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 201))
-    return lx.simulate(pendulum(), lx.State(np.array([0.4]), np.array([3.0])), t1=1.0, saveat=saveat)
+    return lx.simulate(pendulum(0.8, 1.3), lx.State(np.array([0.4]), np.array([3.0])), t1=1.0, saveat=saveat)
 
 
 def test_angles_of_cut_joints_are_unwrapped():
