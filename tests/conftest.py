@@ -5,8 +5,10 @@
 
 import gc
 import os
+import re
 import sys
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 # The settings that users have, for tests marked users_settings.
@@ -58,17 +60,25 @@ gc.set_threshold(20_000, 20, 50)  # tracing makes many objects at a time, few of
 CACHE_SETTINGS = {name: value for name, value in jax.config.values.items() if "cache" in name}
 
 
+SHARED = re.compile(r"^from (?:mechanisms import (\w+)|(known_answers) import)", re.MULTILINE)
+
+
+@cache
+def _group(path):
+    """What tests share programs by: the first mechanism that their file takes, or scenes with known answers."""
+    found = SHARED.search(path.read_text())
+    return path.stem if found is None else found[1] or found[2]
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Keep together the tests of a file, which share programs, or of a mechanism; begin with the longest."""
-    for item in items:
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
-    group = lambda item: item.get_closest_marker("xdist_group").args[0]
+    """Give tests that share programs to one worker; the longest groups first, so that none is waited for at the end."""
     length = Counter()
-    for path, name in {(item.path, group(item)) for item in items}:
-        length[name] += path.stat().st_size
-    items.sort(key=lambda item: (-length[group(item)], group(item)))
+    for path in {item.path for item in items}:
+        length[_group(path)] += path.stat().st_size
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(_group(item.path)))
+    items.sort(key=lambda item: (-length[_group(item.path)], _group(item.path)))
 
 
 # Compiled programs hold memory maps, of which Linux gives a process 65 530 unless it is told otherwise. Programs of the

@@ -4,6 +4,7 @@ import resource
 
 import pytest
 
+EXEMPT = ("slow", "users_settings")
 LONGEST = 10  # tests that the summary names
 TIME = "processor time [s]"
 BEGIN = pytest.StashKey[float]()
@@ -31,7 +32,7 @@ def pytest_runtest_teardown(item):
     time = _used() - item.stash[BEGIN]
     item.user_properties.append((TIME, time))
     most = float(item.config.getini("most_processor_time"))
-    if time > most and not item.get_closest_marker("slow"):
+    if time > most and not any(map(item.get_closest_marker, EXEMPT)):
         pytest.fail(
             f"took {time:.1f} s of processor time, and a test may take {most:g}: share a mechanism of "
             "tests/mechanisms.py with others, so that less is compiled, or mark it slow",
