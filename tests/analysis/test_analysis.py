@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from known_answers import start
+from mechanisms import pendulum
 
 import linkax as lx
 from linkax.scenes import SCENES
@@ -47,15 +48,9 @@ def test_derivative_of_the_distance_from_a_singular_configuration():
     np.testing.assert_allclose(found, differences, rtol=1e-6)
 
 
-def hanging(length, damping):
-    rod = lx.rod("rod", length, 2.0)
-    hinge = lx.Revolute("hinge", lx.GROUND, rod.at("base"), "z")
-    return lx.Mechanism([rod], [hinge], [lx.Gravity([0.0, -9.81, 0.0]), lx.JointDamper("hinge", damping)])
-
-
 def test_a_pendulum_comes_to_rest_and_vibrates():
-    mechanism = hanging(0.8, 0.3)
-    rest = lx.equilibrium(mechanism, lx.assemble(mechanism, {"hinge": 0.3}))
+    mechanism = pendulum(length=0.8, mass=2.0, forces=[lx.JointDamper("hinge", 0.3)])
+    rest = lx.equilibrium(mechanism, lx.State(jnp.array([0.3]), jnp.zeros(1)))
     np.testing.assert_allclose(rest.q, -np.pi / 2, atol=1e-12)
     found = lx.linearise(mechanism, rest)
     natural, rate = np.sqrt(1.5 * 9.81 / 0.8), 0.3 / (2.0 * 0.8**2 / 3.0)
@@ -101,9 +96,9 @@ def test_derivative_of_an_equilibrium_and_of_a_frequency():
     np.testing.assert_allclose(jax.grad(lambda k: stretched(k)[0])(30.0), found[0], rtol=1e-9)
 
 
-@pytest.mark.parametrize("order", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_derivatives_of_modes_and_frequencies(order):
-    """Of two bodies on one guide, the first between wall and spring, the second behind the spring."""
+    """And they: of two bodies on one guide, the first between wall and spring, the second behind the spring."""
 
     def modes(masses):
         bodies = [lx.point_mass("first", masses[0]), lx.point_mass("second", masses[1])]
@@ -120,11 +115,13 @@ def test_derivatives_of_modes_and_frequencies(order):
         values, vectors = jnp.linalg.eigh((flexible + flexible.T) / 2)
         return jnp.sqrt(values), jnp.abs(jnp.linalg.solve(root.T, vectors))
 
-    at = jnp.array([1.3, 0.7])
+    def with_derivatives(function):
+        return jax.jacfwd(lambda masses: 2 * (function(masses),), has_aux=True)
+
     for _ in range(order):
-        modes, exact = jax.jacfwd(modes), jax.jacfwd(exact)
-    for found, known in zip(jax.jit(modes)(at), exact(at), strict=True):
-        np.testing.assert_allclose(found, known, atol=1e-9)
+        modes, exact = with_derivatives(modes), with_derivatives(exact)
+    at = jnp.array([1.3, 0.7])
+    jax.tree.map(lambda *pair: np.testing.assert_allclose(*pair, atol=1e-9), jax.jit(modes)(at), jax.jit(exact)(at))
 
 
 @pytest.mark.parametrize("rod", [0.02, 0.3])

@@ -22,7 +22,7 @@ def cantilever(force=(0.0, 0.0, 0.0), moment=0.0, tip_mass=0.0, elements=8, iner
 
 
 def at_rest(mechanism):
-    return lx.Solution.of_state(mechanism, lx.equilibrium(mechanism, lx.assemble(mechanism)))
+    return lx.Solution.of_state(mechanism, lx.equilibrium(mechanism, lx.State.as_drawn(mechanism)))
 
 
 def tip(mechanism):

@@ -21,7 +21,7 @@ def equal_lengths(angle, speed, gravity):
     return SCENES["crank-slider"].settings(changes=changes)
 
 
-@pytest.mark.parametrize("gravity", [0.0, 9.81])
+@pytest.mark.parametrize("gravity", [pytest.param(0.0, marks=pytest.mark.slow), 9.81])
 def test_starts_in_motion(gravity):
     """Towards it and away from it the motion is as accurate as from anywhere else, on the branch it began on."""
     for distance in (*DISTANCES, 0.0):

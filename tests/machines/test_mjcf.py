@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -233,14 +234,15 @@ def test_other_spatial_tendons_are_not_dropped_in_silence(tmp_path, numbers, mor
 
 @pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")
 @pytest.mark.parametrize(
-    ("name", "loops", "freedoms", "redundant"), [("robotiq_2f85_v2", 2, 3, 2), ("xarm7_gripper", 2, 1, 2)]
+    ("name", "freedoms"), [pytest.param("robotiq_2f85_v2", 3, marks=pytest.mark.slow), ("xarm7_gripper", 1)]
 )
-def test_grippers_close_their_loops(name, loops, freedoms, redundant):
+def test_grippers_close_their_loops(name, freedoms):
     mechanism = lx.load(MACHINES / f"{name}.xml").mechanism()
     state = lx.assemble(mechanism, {"right_driver_joint": 0.3})
     found = lx.mobility(mechanism, state)
     assert (mechanism.topology.num_cuts, found.degrees_of_freedom, found.num_redundant) == (2, freedoms, 2)
-    assert lx.Solution.of_state(mechanism, state).worst_violation().position < 1e-12
+    open_by = eqx.filter_jit(lambda state: lx.Solution.of_state(mechanism, state).worst_violation().position)
+    assert open_by(state) < 1e-12
 
 
 @pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")

@@ -42,7 +42,9 @@ def check(name, mechanism, state):
     assert found.is_planar == (name != "delta")
 
 
-@pytest.mark.parametrize("name", ["five-bar", "watt-six-bar", "strandbeest"])
+@pytest.mark.parametrize(
+    "name", ["watt-six-bar", *(pytest.param(name, marks=pytest.mark.slow) for name in ("five-bar", "strandbeest"))]
+)
 def test_loops_and_mobility_as_drawn(name):
     """All coordinates are zero there, and the loops closed."""
     check(name, *drawn(name))
