@@ -23,10 +23,11 @@ def _row_of_four_bars(_seed):
     "make",
     [
         _row_of_four_bars,
-        mechanisms.floating,
         mechanisms.cut,
-        mechanisms.driven,
-        pytest.param(mechanisms.bending, marks=pytest.mark.slow),
+        *(
+            pytest.param(make, marks=pytest.mark.slow)
+            for make in (mechanisms.floating, mechanisms.driven, mechanisms.bending)
+        ),
     ],
 )
 def test_slopes_of_joints_are_those_along_all_speeds(make):

@@ -19,7 +19,7 @@ SOLVERS = [
 RUNS = {"crank-slider": ("regular", 0.4), "pendulum": ("A01", 2.0)}
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", ["crank-slider", pytest.param("pendulum", marks=SLOW)])
 @pytest.mark.parametrize(("solver", "order", "counts"), SOLVERS)
 def test_order(name, solver, order, counts):
     variant, t1 = RUNS[name]

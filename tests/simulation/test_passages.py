@@ -4,7 +4,7 @@ import diffrax
 import numpy as np
 import pytest
 from known_answers import reference, start
-from mechanisms import raised
+from mechanisms import raised_exactly, sarrus
 
 import linkax as lx
 
@@ -57,7 +57,8 @@ SAVED = {
 @pytest.mark.parametrize("saved", [*list(SAVED)[:2], pytest.param("many times", marks=pytest.mark.slow)])
 def test_passages_are_found_once_however_the_run_was_saved(saved):
     """With redundant rows, and two rows lost at once in some."""
-    mechanism, state = raised(np.pi / 3, {"base_x": 0.0})
+    mechanism = sarrus()
+    state = raised_exactly(mechanism, np.pi / 3, 0.0)
     found = lx.simulate(mechanism, state, t1=3.0, accuracy=lx.PRECISE, saveat=diffrax.SaveAt(ts=SAVED[saved]))
     passages = found.passages()
     np.testing.assert_allclose(passages.times, SARRUS, atol=1e-7)

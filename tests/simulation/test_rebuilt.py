@@ -93,6 +93,10 @@ def test_another_constant_speed_compiles_nothing():
     assert not compiled
     np.testing.assert_allclose(first, [3.3, 6.0], rtol=1e-13)
     np.testing.assert_allclose(other, [0.5, -2.0], rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_derivatives_by_a_constant_speed():
     by_speed, by_start = jax.jit(jax.jacfwd(cruised, (0, 1)))(6.0, 0.3)
     np.testing.assert_allclose([by_speed, by_start], [[0.5, 1.0], [1.0, 0.0]], atol=1e-12)
 

@@ -1,5 +1,7 @@
 """Rows of loops long enough to be solved front by front."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from known_answers import start
@@ -18,18 +20,19 @@ SETTINGS = {"N": COUNT, "angle": 0.0, "speed": -2.0}
 @pytest.fixture(scope="module")
 def row():
     """A row of four-bars with every right joint twice, all links in line."""
-    mechanism, state = start("n-four-bar", "A02", SETTINGS)
+    scene = SCENES["n-four-bar"]
+    mechanism = scene.mechanism(scene.settings("A02", SETTINGS))
     tip = {body.name: body.at("tip") for body in mechanism.bodies}
     again = [lx.Spherical(f"again_{i}", tip[f"coupler_{i}"], tip[f"link_{i}"]) for i in range(1, COUNT + 1)]
-    return lx.Mechanism(mechanism.bodies, [*mechanism.joints, *again], mechanism.forces), state
+    return lx.Mechanism(mechanism.bodies, [*mechanism.joints, *again], mechanism.forces)
 
 
 @pytest.mark.slow
 def test_from_a_singular_configuration_through_others_with_redundant_loops(row):
-    mechanism, state = row
-    plan = structure_of(mechanism.topology).elimination
+    _, state = start("n-four-bar", "A02", SETTINGS)
+    plan = structure_of(row.topology).elimination
     assert len(plan.interior) >= COUNT
-    found = lx.simulate(mechanism, state, t1=4.0)
+    found = lx.simulate(row, state, t1=4.0)
     exact = SCENES["n-four-bar"].exact(SCENES["n-four-bar"].settings("A02", SETTINGS), found.ts)["B0"]
     assert np.max(np.linalg.norm(found.position("link_0", at="tip") - exact, axis=-1)) <= 1e-6
     assert found.closest < 1e-2
@@ -39,14 +42,17 @@ def test_from_a_singular_configuration_through_others_with_redundant_loops(row):
 
 
 def test_accelerations_and_corrections_are_those_of_all_loops_at_once(row):
-    mechanism, _ = row
-    _, upright = start("n-four-bar", "A02", {"N": COUNT, "angle": 1.0})
-    system, rng = system_of(mechanism, float), np.random.default_rng(0)
+    q = jnp.array([1.0 if name.startswith("pivot") else -1.0 for name in row.topology.coordinates])
+    system, rng = system_of(row, float), np.random.default_rng(0)
+
+    @eqx.filter_jit
+    def solved(method, f, v):
+        given = linear_system(system, 0.0, q)
+        by_fronts = method.split(given)
+        assert isinstance(by_fronts, BlockInverse)
+        splits, gamma = (by_fronts, method._split_at_once(given)), given.jacobian @ v
+        return [method.solve_accelerations(given, split, f, gamma, 1)[0] for split in splits]
+
     for metric in ("mass", "identity"):
-        method = lx.TangentSpace(metric=metric).prepared(float)
-        given = linear_system(system, 0.0, upright.q)
-        f, gamma = rng.normal(size=len(upright.v)), given.jacobian @ rng.normal(size=len(upright.v))
-        by_fronts = method.solve_accelerations(given, method.split(given), f, gamma, 1)[0]
-        at_once = method.solve_accelerations(given, method._split_at_once(given), f, gamma, 1)[0]
+        by_fronts, at_once = solved(lx.TangentSpace(metric=metric).prepared(float), *rng.normal(size=(2, len(q))))
         np.testing.assert_allclose(by_fronts, at_once, atol=1e-11)
-        assert isinstance(method.split(given), BlockInverse)
