@@ -11,6 +11,7 @@ import linkax as lx
 from linkax.scenery.scenery import spans
 
 TIMES = np.linspace(0.0, 0.5, 51)
+SAVE_END = diffrax.SaveAt(t1=True)
 SPEED, START = 0.2, 0.5  # of the slider that a drive moves
 SLIDER = lx.point_mass("slider", 2.0)
 SLIDE = lx.Prismatic("slide", lx.GROUND, SLIDER, "x")
@@ -31,7 +32,9 @@ def moved():
         lx.PneumaticSpring(WALL, SLIDER, **GAS, exponent=1.0, flow=lambda t, motion: 0.5, name="filled"),
     ]
     mechanism = lx.Mechanism([SLIDER], [SLIDE], forces, [lx.Drive("drive", "slide", speed=SPEED, start=START)])
-    return lx.simulate(mechanism, lx.assemble(mechanism), t1=0.5, saveat=diffrax.SaveAt(ts=TIMES))
+    return lx.simulate(
+        mechanism, lx.State(jnp.full(1, START), jnp.full(1, SPEED)), t1=0.5, saveat=diffrax.SaveAt(ts=TIMES)
+    )
 
 
 def test_a_motor_at_constant_speed(moved):
@@ -100,6 +103,10 @@ STIFFNESS = 1.4e9 * (2e-3**2 / (1e-4 + 2e-3 * 0.3) + 1.2e-3**2 / (1e-4 + 1.2e-3 
 MASS = 500.0
 
 
+def at_rest(coordinate):
+    return lx.State(jnp.full(1, coordinate), jnp.zeros(1))
+
+
 class Metered(lx.HydraulicCylinder):
     """A cylinder that also counts the oil in its chambers, at the density of each, over that without pressure [m³]."""
 
@@ -123,15 +130,14 @@ def cylinder(opening, kind=lx.HydraulicCylinder, force=0.0, **numbers):
     slide = lx.Prismatic("slide", lx.GROUND, load, "x")
     acts_on = ("slide",) if kind is lx.HydraulicActuator else (lx.GROUND, load)
     element = kind(*acts_on, opening, **CYLINDER | numbers, name="cylinder")
-    mechanism = lx.Mechanism([load], [slide], [element, lx.JointTorque("slide", force)])
-    return mechanism, lx.assemble(mechanism, {"slide": 0.7})
+    return lx.Mechanism([load], [slide], [element, lx.JointTorque("slide", force)]), at_rest(0.7)
 
 
 def test_oil_that_flows_in_is_compressed_displaced_or_leaks():
     mechanism, state = cylinder(lambda t, motion: jnp.sin(4.0 * t), Metered, leakage=1e-11, damping=2e3)
     solution = lx.simulate(mechanism, state, t1=0.5, accuracy=lx.PRECISE)
     found = solution.states("cylinder")
-    x = solution.joint("slide") - 0.4
+    x = solution.q[:, 0] - 0.4
     volumes = {"a": 1e-4 + 2e-3 * x, "b": 1e-4 + 1.2e-3 * (0.6 - x)}
     for name, volume in volumes.items():
         oil = np.exp(found[name] / 1.4e9) * volume
@@ -139,7 +145,13 @@ def test_oil_that_flows_in_is_compressed_displaced_or_leaks():
         assert np.max(np.abs(oil - oil[0])) > 1e-2 * oil[0]
 
 
-@pytest.mark.parametrize("kind", [lx.HydraulicCylinder, lx.HydraulicActuator], ids=["between-points", "along-a-slide"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(lx.HydraulicCylinder, id="between-points"),
+        pytest.param(lx.HydraulicActuator, id="along-a-slide", marks=pytest.mark.slow),
+    ],
+)
 def test_a_load_on_locked_oil_swings_as_on_a_spring(kind):
     """A step of force: x = F / K (1 − cos ω t), with ω² = K / m."""
     mechanism, state = cylinder(0.0, kind, force=100.0)
@@ -147,7 +159,7 @@ def test_a_load_on_locked_oil_swings_as_on_a_spring(kind):
     ts = np.linspace(0.0, 6.0 / frequency, 101)
     solution = lx.simulate(mechanism, state, t1=ts[-1], saveat=diffrax.SaveAt(ts=ts))
     moved = 100.0 / STIFFNESS * (1.0 - np.cos(frequency * ts))
-    np.testing.assert_allclose(solution.joint("slide") - 0.7, moved, atol=1e-3 * 200.0 / STIFFNESS)
+    np.testing.assert_allclose(solution.q[:, 0] - 0.7, moved, atol=1e-3 * 200.0 / STIFFNESS)
 
 
 def test_a_controlled_cylinder_is_behind_a_ramp_by_its_speed_over_the_gain():
@@ -157,23 +169,23 @@ def test_a_controlled_cylinder_is_behind_a_ramp_by_its_speed_over_the_gain():
     def lag(gain):
         behind = lambda t, motion: gain / full * (0.7 + speed * t - motion.length("cylinder"))
         mechanism, state = cylinder(behind, lx.HydraulicActuator, areas=(2e-3, 2e-3), tank=0.0, damping=1e4)
-        solution = lx.simulate(mechanism, state, t1=4.0)
-        x = solution.joint("slide")
-        np.testing.assert_allclose(solution.length("cylinder"), x, rtol=1e-15)
-        return 0.7 + 4.0 * speed - x[-1]
+        solution = lx.simulate(mechanism, state, t1=4.0, saveat=SAVE_END)
+        np.testing.assert_allclose(solution.length("cylinder"), solution.q[:, 0], rtol=1e-15)
+        return 0.7 + 4.0 * speed - solution.end.q[0]
 
     drop = (2e7 - speed * 1e4 / 2e-3) / 2.0  # in each half of the valve, less what moves the seals
     lags = np.array([lag(jnp.array(gain)) for gain in (5.0, 10.0)])
     np.testing.assert_allclose(lags, speed / np.array([5.0, 10.0]) * np.sqrt(1e7 / drop), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_rotary_actuator_turns_as_far_as_its_oil():
     """An arm on a hinge, without load and leakage, moves by the oil over the volume of a radian."""
     opening = lx.PiecewiseLinear([0.0, 0.1, 0.4, 0.5], [0.0, 0.5, 0.5, 0.0])
     numbers = {"areas": (2e-4, 2e-4), "dead_volume": 1e-4, "closed": -1.0, "stroke": 2.0, "valve": 1e-8, "supply": 1e7}
     actuator = lx.HydraulicActuator("hinge", opening, **numbers, damping=20.0, pressures=(5e6, 5e6), name="motor")
     mechanism = lx.Mechanism([ARM], [HINGE], [actuator])
-    solution = lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": -0.5}), t1=1.0)
+    solution = lx.simulate(mechanism, at_rest(-0.5), t1=1.0, saveat=SAVE_END)
     flow = 0.5 * 0.4 * 1e-8 * np.sqrt(5e6)  # through each half of the valve, with half of the pressure
     assert abs(solution.end.q[0] + 0.5 - flow / 2e-4) < 0.02 * flow / 2e-4
     np.testing.assert_allclose(solution.force("motor")[-1], 0.0, atol=0.1)
@@ -196,7 +208,7 @@ def hinged(*forces):
 def test_an_integrator_leaves_no_error():
     gains = {"proportional": 60.0, "integral": 60.0, "derivative": 10.0, "filter_time": 0.01}
     mechanism = hinged(lx.PIDController("hinge", 0.5, **gains, name="controller"))
-    solution = lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": 0.0}), t1=20.0)
+    solution = lx.simulate(mechanism, at_rest(0.0), t1=20.0, saveat=SAVE_END)
     assert abs(solution.end.q[0] - 0.5) < 1e-7
     weight = 9.81 * 0.5 * np.cos(0.5)
     np.testing.assert_allclose(60.0 * solution.states("controller")["integral"][-1], weight, rtol=1e-6)
@@ -209,7 +221,7 @@ def test_a_joint_with_stiction_stays():
     torque = lx.JointTorque("hinge", lx.Spline([0.0, 5.0], [0.0, 4.0]))
     mechanism = lx.Mechanism([ARM], [HINGE], [torque, lx.LuGreFriction("hinge", **friction, name="friction")])
     saveat = diffrax.SaveAt(ts=np.array([6.0, 10.0]))
-    solution = lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": 0.0}), t1=10.0, saveat=saveat)
+    solution = lx.simulate(mechanism, at_rest(0.0), t1=10.0, saveat=saveat)
     np.testing.assert_allclose(solution.force("friction"), -4.0, rtol=1e-6)
     np.testing.assert_allclose(solution.states("friction")["deflection"], 4.0 / 1e3, rtol=1e-6)
     np.testing.assert_allclose(solution.joint("hinge"), -6.0 / 1e3 * np.log(1.0 - 4.0 / 6.0), rtol=1e-3)
@@ -220,17 +232,19 @@ VALUES = np.array([1.0, 2.0, 0.5, 0.7])
 
 
 def test_laws_go_through_their_values():
-    ts = np.linspace(0.0, 1.2, 50)
+    ts = np.array([-1.0, 2.0, 1.0, *np.linspace(0.0, 1.2, 50)])
     linear, spline = lx.PiecewiseLinear(RISE, VALUES), lx.Spline(RISE, VALUES, end_slopes=(0.3, -1.0))
     reference = CubicSpline(RISE, VALUES, bc_type=((1, 0.3), (1, -1.0)))
-    np.testing.assert_allclose(jax.vmap(linear)(ts), np.interp(ts, RISE, VALUES), rtol=1e-14)
-    np.testing.assert_allclose(jax.vmap(spline)(ts), reference(ts), rtol=1e-13)
-    np.testing.assert_allclose(jax.vmap(jax.grad(spline))(ts[1:-1]), reference(ts[1:-1], 1), rtol=1e-12, atol=1e-12)
-    for law in (linear, spline):
-        np.testing.assert_allclose([law(-1.0), law(2.0)], VALUES[[0, -1]], rtol=1e-14)
     vectors = lx.Spline(RISE, np.stack([VALUES, -VALUES, 0.0 * VALUES], axis=1))
-    np.testing.assert_allclose(vectors(0.4), lx.Spline(RISE, VALUES)(0.4) * np.array([1.0, -1.0, 0.0]))
-    np.testing.assert_allclose(lx.Spline([0.0, 2.0], [0.0, 1.0])(1.0), 0.5)
+    natural, line = lx.Spline(RISE, VALUES), lx.Spline([0.0, 2.0], [0.0, 1.0])
+    laws = (linear, spline, jax.grad(spline), natural, vectors, line)
+    lines, splines, slopes, numbers, rows, shares = jax.jit(lambda ts: [jax.vmap(law)(ts) for law in laws])(ts)
+    np.testing.assert_allclose(lines, np.interp(ts, RISE, VALUES), rtol=1e-14)
+    np.testing.assert_allclose(splines[:2], VALUES[[0, -1]], rtol=1e-14)
+    np.testing.assert_allclose(splines[2:], reference(ts[2:]), rtol=1e-13)
+    np.testing.assert_allclose(slopes[4:-1], reference(ts[4:-1], 1), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(rows, numbers[:, None] * np.array([1.0, -1.0, 0.0]))
+    np.testing.assert_allclose(shares[2], 0.5)
 
 
 def test_wrong_numbers_are_told():
@@ -263,7 +277,7 @@ def _controlled(values):
     rotary = {"areas": (2e-5, 2e-5), "dead_volume": 1e-5, "valve": 1e-8, "closed": -1.0, "stroke": 4.0, "supply": 1e6}
     turning = lx.HydraulicActuator("hinge", opening, **CYLINDER | rotary, leakage=1e-12 * values[0])
     mechanism = hinged(motor, friction, controller, maxwell, jack, turning)
-    solution = lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": 0.3}), t1=0.6, accuracy=lx.PRECISE)
+    solution = lx.simulate(mechanism, at_rest(0.3), t1=0.6, accuracy=lx.PRECISE)
     return jnp.concatenate([solution.end.q, solution.end.internal / jnp.array([1.0, 0.01, 1.0, 1.0, 1.0, *[1e6] * 4])])
 
 

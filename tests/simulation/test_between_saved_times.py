@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import crank_slider, pendulum
 
 import linkax as lx
-from tests.mechanisms import crank_slider
 
 EVERY = (6, 3)  # of the saved states: what is left of them
 
@@ -29,11 +29,16 @@ def loop():
 
 
 @pytest.fixture(scope="module")
+def rod():
+    return swing(0.4, accuracy=lx.Accuracy(1e-11))
+
+
+@pytest.fixture(scope="module")
 def top():
     """A body that turns about all axes, by a quaternion."""
     body = lx.RigidBody("top", 1.0, [0.0, 0.0, 0.3], inertia=[0.1, 0.12, 0.05])
     mechanism = lx.Mechanism([body], [lx.Spherical("ball", lx.GROUND, body)], [lx.Gravity([0.0, 0.0, -9.81])])
-    state = lx.assemble(mechanism, speeds={"ball": [2.0, 1.0, 5.0]})
+    state = lx.State(jnp.eye(4)[0], jnp.array([2.0, 1.0, 5.0]))
     saveat = diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 121))
     return lx.simulate(mechanism, state, t1=1.0, accuracy=lx.Accuracy(1e-11), saveat=saveat)
 
@@ -63,28 +68,33 @@ def test_at_saved_times_nothing_changes(top):
     np.testing.assert_allclose(back.v, solution.v[::-1], rtol=1e-11, atol=1e-12)
 
 
-def test_derivatives_by_time_are_speeds(loop):
-    ts = jnp.array([0.123, 0.5, 0.789])
-    pin = lambda t: loop.at(t).joint("wrist_pin")
-    _, along = jax.jvp(pin, (ts,), (jnp.ones(3),))
-    np.testing.assert_allclose(along, loop.at(ts).joint_speed("wrist_pin"), rtol=1e-7)
-    np.testing.assert_allclose(jax.grad(lambda t: jnp.sum(pin(t)))(ts), along, rtol=1e-9)
+@pytest.mark.parametrize(
+    ("name", "joint"), [pytest.param("loop", "wrist_pin", marks=pytest.mark.slow), ("rod", "hinge")]
+)
+def test_derivatives_by_time_are_speeds(name, joint, request):
+    solution, ts = request.getfixturevalue(name), jnp.array([0.123, 0.5, 0.789])
+
+    @jax.jit
+    def read(ts):
+        turned = lambda t: solution.at(t).joint(joint)
+        _, along = jax.jvp(turned, (ts,), (jnp.ones(3),))
+        return along, solution.at(ts).joint_speed(joint), jax.grad(lambda t: jnp.sum(turned(t)))(ts)
+
+    along, speeds, backwards = read(ts)
+    np.testing.assert_allclose(along, speeds, rtol=1e-7)
+    np.testing.assert_allclose(backwards, along, rtol=1e-9)
+
+
+def swing(angle, steps=4096, **options):
+    state, saveat = lx.State(jnp.reshape(angle, 1), jnp.zeros(1)), diffrax.SaveAt(ts=jnp.linspace(0.0, 1.0, 41))
+    return lx.simulate(pendulum(), state, t1=1.0, saveat=saveat, max_steps=steps, throw=False, **options)
 
 
 def test_batches_and_times_of_their_own():
-    arm = lx.rod("arm", 1.0, 1.0)
-    hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
-    mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -9.81, 0.0])])
-    saveat = diffrax.SaveAt(ts=jnp.linspace(0.0, 1.0, 41))
-
-    def swing(angle, steps=4096):
-        state = lx.State(jnp.reshape(angle, 1), jnp.zeros(1))
-        return lx.simulate(mechanism, state, t1=1.0, saveat=saveat, max_steps=steps, throw=False)
-
     solution = jax.vmap(swing)(jnp.array([-0.5, 0.7]))
     shared = solution.at([0.11, 0.52, 0.52]).joint("hinge")
     own = solution.at(jnp.array([[0.11, 0.52], [0.52, 0.11]])).joint("hinge")
-    np.testing.assert_allclose(shared[:, :2], jnp.stack([own[0], own[1, ::-1]]), rtol=1e-12)
+    np.testing.assert_allclose(shared[:, :2], np.stack([own[0], own[1, ::-1]]), rtol=1e-12)
     # Times that are traced, and outside: infinite, and harmless to the derivatives of others.
     total = lambda ts: jnp.sum(jnp.where(jnp.array([True, False, False]), solution.at(ts).joint("hinge")[0], 0.0))
     slope = jax.jit(jax.grad(total))(jnp.array([0.5, 1.5, -0.1]))

@@ -5,23 +5,18 @@ import warnings
 
 import numpy as np
 import pytest
-from mechanisms import coupler_between_balls
+from mechanisms import coupler_between_balls, pendulum
 
 import linkax as lx
 
 
-def swing(*more):
-    arm = lx.rod("arm", 1.0, 1.0)
-    return lx.Mechanism([arm], [lx.Revolute("pin", lx.GROUND, arm.at("base"), axis="z")], *more)
-
-
 def test_angles_that_may_be_degrees():
-    with pytest.warns(lx.AssemblyWarning, match=r"position of joint 'pin' is 90 rad.*deg2rad\(90\)"):
-        lx.assemble(swing(), {"pin": 90.0})
+    with pytest.warns(lx.AssemblyWarning, match=r"position of joint 'hinge' is 90 rad.*deg2rad\(90\)"):
+        lx.assemble(pendulum(), {"hinge": 90.0})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        lx.assemble(swing(), {"pin": -9.4})
-        lx.assemble(swing([lx.JointSpring("pin", 2.0)]), {"pin": 90.0})  # which counts turns
+        lx.assemble(pendulum(), {"hinge": -9.4})
+        lx.assemble(pendulum(forces=[lx.JointSpring("hinge", 2.0)]), {"hinge": 90.0})  # which counts turns
 
 
 def test_struts_of_lengths_of_both_signs():

@@ -44,8 +44,9 @@ def machine(damping=0.4):
 
 
 def moving(mechanism):
-    positions, speeds = {"x": 2.0 * np.sin(0.4), "y": -2.0 * np.cos(0.4)}, {"x": 1.5, "axle": 0.2}
-    return lx.assemble(mechanism, positions, speeds)
+    x, y = 2.0 * np.sin(0.4), -2.0 * np.cos(0.4)
+    of = {"x": (x, 1.5), "y": (y, -1.5 * x / y), "motor": (0.0, RATE + 1.0), "axle": (0.0, 0.2)}
+    return lx.State(*map(jnp.stack, zip(*(of[name] for name in mechanism.topology.coordinates), strict=True)))
 
 
 @pytest.fixture(scope="module")

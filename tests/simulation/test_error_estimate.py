@@ -29,7 +29,7 @@ def ratio(estimate, solution):
     return np.max(estimate) / np.max(np.abs(position(solution) - exact(solution)))
 
 
-@pytest.mark.parametrize("dtype", [float, jnp.float32])
+@pytest.mark.parametrize("dtype", [float, pytest.param(jnp.float32, marks=pytest.mark.slow)])
 def test_estimates_are_the_errors(pendulum, dtype):
     found = lx.simulate(*pendulum, t1=5.0, accuracy=lx.DRAFT, dtype=dtype)
     estimate = found.error_estimate(position)

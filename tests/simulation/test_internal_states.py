@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from mechanisms import pendulum
 
 import linkax as lx
 
 VOLTAGE, RESISTANCE, INDUCTANCE, CONSTANT = 12.0, 2.0, 0.1, 0.5
-PIN = lx.Term("pin", None)
-ROD = lx.rod("rod", 1.0, mass=1.0)
+HINGE = lx.Term("hinge", None)
 TIMES = np.linspace(0.0, 0.5, 41)
 
 
@@ -28,42 +28,40 @@ class Motor(lx.AbstractForce):
 
     @property
     def terms(self):
-        return (PIN,)
+        return (HINGE,)
 
     @property
     def states(self):
         return {"current": lx.InternalState(self.current, "A")}
 
     def rates(self, t, motion, states):
-        induced = CONSTANT * motion.joint_speed("pin")
+        induced = CONSTANT * motion.joint_speed("hinge")
         return {"current": (VOLTAGE - self.resistance * states["current"] - induced) / self.inductance}
 
     def strength(self, t, motion, states):
         return CONSTANT * states["current"]
 
     def load(self, t, motion, states):
-        return motion.joint_load(PIN, self.strength(t, motion, states))
+        return motion.joint_load(HINGE, self.strength(t, motion, states))
 
 
-def pendulum(*forces, constraints=()):
-    pin = lx.Revolute("pin", lx.GROUND, ROD, "z")
-    return lx.Mechanism([ROD], [pin], [lx.Gravity([0.0, -9.81, 0.0]), *forces], constraints)
+def at_rest(angle):
+    return lx.State(jnp.full(1, angle), jnp.zeros(1))
 
 
 def turned(mechanism, t1=0.5, **options):
     times = TIMES[t1 >= TIMES]
-    state = lx.assemble(mechanism, {"pin": 0.3})
-    return lx.simulate(mechanism, state, **{"t1": t1, "saveat": diffrax.SaveAt(ts=times)} | options)
+    return lx.simulate(mechanism, at_rest(0.3), **{"t1": t1, "saveat": diffrax.SaveAt(ts=times)} | options)
 
 
 @pytest.fixture(scope="module")
 def driven():
-    return turned(pendulum(Motor()))
+    return turned(pendulum(forces=[Motor()]))
 
 
 def test_the_current_of_a_blocked_motor_rises_as_the_circuit_says():
-    held = lx.Drive("hold", "pin", lambda t: 0.3 + 0.0 * t)
-    solution = turned(pendulum(Motor(), constraints=[held]))
+    held = lx.Drive("hold", "hinge", lambda t: 0.3 + 0.0 * t)
+    solution = turned(pendulum(forces=[Motor()], constraints=[held]))
     current = lambda t: VOLTAGE / RESISTANCE * (1.0 - np.exp(-RESISTANCE / INDUCTANCE * t))
     np.testing.assert_allclose(solution.states("motor")["current"], current(TIMES), atol=2e-7)
     np.testing.assert_allclose(solution.force("motor"), CONSTANT * current(TIMES), atol=2e-7)
@@ -87,12 +85,12 @@ def test_a_run_goes_on_from_its_end(driven):
 def test_a_solution_of_one_state_knows_them(driven):
     here = lx.Solution.of_state(driven.mechanism, driven.end, t=0.5)
     np.testing.assert_allclose(here.states("motor")["current"], driven.states("motor")["current"][-1:])
-    np.testing.assert_allclose(here.joint_acceleration("pin"), driven.joint_acceleration("pin")[-1:])
-    np.testing.assert_allclose(here.reaction("pin").force, driven.reaction("pin").force[-1:])
+    np.testing.assert_allclose(here.joint_acceleration("hinge"), driven.joint_acceleration("hinge")[-1:])
+    np.testing.assert_allclose(here.reaction("hinge").force, driven.reaction("hinge").force[-1:])
 
 
 def _final(parameters):
-    solution = turned(pendulum(Motor(*parameters)), accuracy=lx.PRECISE)
+    solution = turned(pendulum(forces=[Motor(*parameters)]), accuracy=lx.PRECISE)
     return jnp.stack([solution.end.q[0], solution.end.internal[0], solution.states("motor")["current"][17]])
 
 
@@ -108,7 +106,7 @@ def test_derivatives_in_both_modes_by_numbers_and_initial_values():
 @pytest.mark.slow
 def test_a_batch_is_read_as_its_members_are(driven):
     currents = jnp.array([0.0, 1.0])
-    batch = jax.vmap(lambda current: turned(pendulum(Motor(current=current))))(currents)
+    batch = jax.vmap(lambda current: turned(pendulum(forces=[Motor(current=current)])))(currents)
     found = batch.states("motor")["current"]
     assert found.shape == (2, len(TIMES))
     np.testing.assert_allclose(found[:, 0], currents)
@@ -139,9 +137,8 @@ def test_steps_keep_errors_small_in_the_scale_of_a_state():
     """An array of two states. Next to a pendulum at rest, only their errors choose the steps."""
     errors = []
     for size in (1.0, 1e-6):
-        mechanism = pendulum(Relaxing(size))
-        state = lx.assemble(mechanism, {"pin": -np.pi / 2})
-        solution = lx.simulate(mechanism, state, t1=0.5, saveat=diffrax.SaveAt(ts=TIMES))
+        mechanism = pendulum(forces=[Relaxing(size)])
+        solution = lx.simulate(mechanism, at_rest(-np.pi / 2), t1=0.5, saveat=diffrax.SaveAt(ts=TIMES))
         exact = size * np.exp(-30.0 * TIMES)[:, None] * [1.0, 2.0]
         errors.append(np.max(np.abs(solution.states("relaxing")["pair"] - exact)) / size)
     assert max(errors) < 5e-7
@@ -150,8 +147,8 @@ def test_steps_keep_errors_small_in_the_scale_of_a_state():
 
 @pytest.mark.slow
 def test_a_stiff_state_is_told_with_the_solver_that_suits():
-    mechanism = pendulum(Relaxing(rate=2e4))
-    state = lx.assemble(mechanism, {"pin": 0.3})
+    mechanism = pendulum(forces=[Relaxing(rate=2e4)])
+    state = at_rest(0.3)
     with pytest.warns(lx.StiffnessWarning, match="Relaxing 'relaxing', whose fastest rate is 2.0e.04.*Rodas5P"):
         lx.simulate(mechanism, state, t1=0.5)
     solution = lx.simulate(mechanism, state, t1=0.5, solver=lx.Rodas5P())
@@ -165,7 +162,7 @@ class Latch(lx.AbstractForce):
 
     @property
     def terms(self):
-        return (PIN,)
+        return (HINGE,)
 
     @property
     def states(self):
@@ -178,15 +175,15 @@ class Latch(lx.AbstractForce):
         return states["clock"] - 1.0 / 6.0
 
     def load(self, t, motion, states, on):
-        return motion.joint_load(PIN, jnp.where(on, 5.0, 0.0))
+        return motion.joint_load(HINGE, jnp.where(on, 5.0, 0.0))
 
 
 @pytest.mark.slow
 def test_a_switch_may_depend_on_a_state():
-    latched = turned(pendulum(Latch()), accuracy=lx.PRECISE)
-    after = lx.JointTorque("pin", 5.0)
-    free, driven = pendulum(), pendulum(after)
-    first = lx.simulate(free, lx.assemble(free, {"pin": 0.3}), t1=1.0 / 6.0, accuracy=lx.PRECISE)
+    latched = turned(pendulum(forces=[Latch()]), accuracy=lx.PRECISE)
+    after = lx.JointTorque("hinge", 5.0)
+    free, driven = pendulum(), pendulum(forces=[after])
+    first = lx.simulate(free, at_rest(0.3), t1=1.0 / 6.0, accuracy=lx.PRECISE)
     second = lx.simulate(driven, first.end, t0=1.0 / 6.0, t1=0.5, accuracy=lx.PRECISE)
     np.testing.assert_allclose(latched.end.q, second.end.q, atol=1e-10)
     np.testing.assert_allclose(latched.end.v, second.end.v, atol=1e-9)
@@ -194,7 +191,7 @@ def test_a_switch_may_depend_on_a_state():
 
 @pytest.mark.slow
 def test_single_precision():
-    solution = turned(pendulum(Motor()), dtype=jnp.float32, accuracy=lx.DRAFT)
+    solution = turned(pendulum(forces=[Motor()]), dtype=jnp.float32, accuracy=lx.DRAFT)
     assert solution.internal.dtype == jnp.float32
     assert solution.result == lx.RESULTS.successful
 
@@ -206,11 +203,11 @@ class Learned(lx.AbstractForce):
 
     @property
     def terms(self):
-        return (PIN,)
+        return (HINGE,)
 
     def load(self, t, motion):
-        seen = jnp.stack([motion.joint("pin"), motion.joint_speed("pin")])
-        return motion.joint_load(PIN, self.network(seen))
+        seen = jnp.stack([motion.joint("hinge"), motion.joint_speed("hinge")])
+        return motion.joint_load(HINGE, self.network(seen))
 
 
 @pytest.mark.slow
@@ -220,7 +217,7 @@ def test_a_network_may_be_a_force():
     flat, restored = ravel_pytree(weights)
 
     def end(flat):
-        return turned(pendulum(Learned(eqx.combine(restored(flat), function))), accuracy=lx.PRECISE).end.q[0]
+        return turned(pendulum(forces=[Learned(eqx.combine(restored(flat), function))]), accuracy=lx.PRECISE).end.q[0]
 
     along = jnp.cos(jnp.arange(len(flat)))
     central = (end(flat + 1e-5 * along) - end(flat - 1e-5 * along)) / 2e-5
@@ -229,10 +226,12 @@ def test_a_network_may_be_a_force():
 
 @pytest.mark.slow
 def test_a_fit_finds_numbers_and_initial_values():
-    measured = turned(pendulum(Motor(2.3, 0.4))).joint("pin")
+    measured = turned(pendulum(forces=[Motor(2.3, 0.4)])).joint("hinge")
 
     def residual(params):
-        return (turned(pendulum(Motor(params["resistance"], params["current"]))).joint("pin") - measured) / 1e-3
+        return (
+            turned(pendulum(forces=[Motor(params["resistance"], params["current"])])).joint("hinge") - measured
+        ) / 1e-3
 
     found = lx.fit(residual, {"resistance": 2.0, "current": 0.1}, progress=False)
     np.testing.assert_allclose([found.params["resistance"], found.params["current"]], [2.3, 0.4], rtol=1e-4)
@@ -279,12 +278,12 @@ class NoStates(WithoutRates):
 )
 def test_mistakes_are_told(kind, message):
     with pytest.raises(ValueError, match=message):
-        turned(pendulum(kind()))
+        turned(pendulum(forces=[kind()]))
 
 
 def test_a_rate_that_is_not_finite_is_told():
     with pytest.raises(lx.SimulationError, match="A rate of the internal states of Endless is not finite"):
-        turned(pendulum(Endless()))
+        turned(pendulum(forces=[Endless()]))
 
 
 def test_states_are_asked_of_elements_that_have_them(driven):
@@ -310,7 +309,7 @@ def test_a_mechanism_without_any_has_none():
 def test_inverse_dynamics_takes_states(driven):
     state = dataclasses.replace(driven.end, v=jnp.zeros(1))
     mechanism = driven.mechanism
-    held = lx.inverse_dynamics(mechanism, state, {"pin": 0.0}).forces["pin"]
+    held = lx.inverse_dynamics(mechanism, state, {"hinge": 0.0}).forces["hinge"]
     gravity = 9.81 * 0.5 * np.cos(state.q[0])
     np.testing.assert_allclose(held, gravity - CONSTANT * state.internal[0])
 
