@@ -39,7 +39,7 @@ from linkax.xla.kept_programs import keep_in  # noqa: E402
 pytest_plugins = ["annotations", "processor_time", "slow_tests"]
 
 # What one test has compiled, in this run or an earlier one, the next one reads; so do processes that tests start.
-KEPT_FROM = 0.05  # to compile [s]; what takes less is compiled in the time that reading takes
+KEPT_FROM = 0.05  # to compile [s]; what takes less is hardly read sooner than it is compiled
 if not AS_USERS_DO and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     folder = program_folder()
     forget_oldest(folder)

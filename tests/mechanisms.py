@@ -43,9 +43,12 @@ def crank_slider(
     return lx.Mechanism([bar, link, slider], joints[::order], [down(9.81), *forces], constraints)
 
 
-def four_bar(crank=0.4, coupler=1.0, rocker=0.9, ground=1.0, cut=None, forces=(), constraints=()):
-    """The planar four-bar, all rods of one kilogram, along x at zero."""
-    rods = [lx.rod("crank", crank, 1.0), lx.rod("coupler", coupler, 1.0), lx.rod("rocker", rocker, 1.0)]
+def four_bar(
+    crank=0.4, coupler=1.0, rocker=0.9, ground=1.0, masses=(1.0, 1.0, 1.0), cut=None, forces=(), constraints=()
+):
+    """The planar four-bar, its rods along x at zero."""
+    lengths = {"crank": crank, "coupler": coupler, "rocker": rocker}
+    rods = [lx.rod(name, length, mass) for (name, length), mass in zip(lengths.items(), masses, strict=True)]
     first, middle, last = rods
     options = lambda name: {"cut": True} if name == cut else {}
     joints = [

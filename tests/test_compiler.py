@@ -128,6 +128,7 @@ def test_programs_are_forgotten_where_memory_maps_run_out(monkeypatch, tmp_path)
     assert kept(1.0) == kept(1.0) == 2.0
     assert len(traces) == 1
     assert memory_maps._limit_of_maps() - memory_maps._maps() > ROOM
+    monkeypatch.setattr(memory_maps, "CACHES", [kept.clear_cache])  # not what all tests have compiled
     _with_limit(monkeypatch, tmp_path, *[ROOM - 1, ROOM] * 2, 70_000)
     with pytest.warns(RuntimeWarning, match=r"nearly all of the 70000 memory maps .* vm\.max_map_count=280000") as told:
         found = both(0.5)
@@ -139,6 +140,7 @@ def test_programs_are_forgotten_where_memory_maps_run_out(monkeypatch, tmp_path)
 
 def test_no_program_is_compiled_where_memory_maps_are_held(monkeypatch, tmp_path):
     """XLA would end the process."""
+    monkeypatch.setattr(memory_maps, "CACHES", [])
     _with_limit(monkeypatch, tmp_path, ROOM - 1)
     with pytest.raises(RuntimeError, match=r"hold 60001 memory maps.* 70000: too many .* vm\.max_map_count=280000"):
         jax.jit(lambda x: x + 1.0)(1.0)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mechanisms import four_bar
 from scipy.spatial.transform import Rotation
 
 import linkax as lx
@@ -178,7 +179,7 @@ def test_linkax_reads_back_the_motion_that_it_writes(case, tmp_path):
 
 
 def test_linkax_reads_back_the_motion_of_a_four_bar(tmp_path):
-    bodies, joints = four_bar()
+    bodies, joints = parts_of_four_bar()
     mechanism = lx.Mechanism(bodies, joints, [lx.Gravity([0.0, -9.81, 0.0]), lx.JointSpring("crank_pin", 5.0, 0.3)])
     # The crank points away from the rocker's bearing: the others are sides of 2 m of a triangle with a base of 3 m.
     angle = np.arccos(0.75)
@@ -188,17 +189,11 @@ def test_linkax_reads_back_the_motion_of_a_four_bar(tmp_path):
     check_that_motions_agree(mechanism, state, tmp_path / "four_bar.xml")
 
 
-def four_bar():
+def parts_of_four_bar():
     """Bodies and joints of a planar four-bar that is open where coordinates are zero; its cut joint is a hinge."""
-    lengths = {"crank": 1.0, "coupler": 2.0, "rocker": 2.0}
-    crank, coupler, rocker = (lx.rod(name, length, 1.0) for name, length in lengths.items())
-    joints = [
-        lx.Revolute("crank_bearing", lx.GROUND, crank.at("base"), axis="z"),
-        lx.Revolute("crank_pin", crank.at("tip"), coupler.at("base"), axis="z"),
-        lx.Revolute("rocker_pin", coupler.at("tip"), rocker.at("tip"), axis="z", cut=True),
-        lx.Revolute("rocker_bearing", lx.GROUND.at([2.0, 0.0, 0.0]), rocker.at("base"), axis="z"),
-    ]
-    return [crank, coupler, rocker], joints
+    whole = four_bar(1.0, 2.0, 2.0, 2.0, cut="rocker_pin")
+    hinges = "crank_bearing", "crank_pin", "rocker_pin", "rocker_bearing"
+    return [whole.body(name) for name in ("crank", "coupler", "rocker")], [whole.joint(name) for name in hinges]
 
 
 def gaps(text):
@@ -212,7 +207,7 @@ def gaps(text):
 
 def test_loops_and_couplings_hold_at_the_keyframe(tmp_path):
     """Hinges, rods, threads and couplings of one, two and three coordinates."""
-    bodies, joints = four_bar()
+    bodies, joints = parts_of_four_bar()
     wheels = [body(name, np.random.default_rng(index)) for index, name in enumerate(("a", "b", "c", "d", "nut"))]
     joints += [lx.Revolute(f"{wheel.name}_bearing", lx.GROUND, wheel, axis="z") for wheel in wheels[:4]]
     joints.append(lx.Screw("screw", wheels[4], wheels[0], axis="z", pitch=0.05))
@@ -246,7 +241,7 @@ class Magnet(lx.AbstractForce):
         return lx.Load.none(motion.system)
 
 
-(CRANK, COUPLER, ROCKER), HINGES = four_bar()
+(CRANK, COUPLER, ROCKER), HINGES = parts_of_four_bar()
 CARDAN = lx.Universal("cardan", COUPLER.at("tip"), ROCKER.at("tip"), axis="z", cut=True)
 BEAM = lx.Beam("boom", 1.0, lx.rectangle(0.1, 0.1, lx.Material(1e9, 0.3, 1e3)))
 BALL = lx.Mechanism([CRANK], [lx.Spherical("ball", lx.GROUND, CRANK)], [lx.JointDamper(("ball", 0), 1.0)])

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import pendulum
 from test_gradients import central_differences
 
 import linkax as lx
@@ -77,9 +78,7 @@ def test_a_number_of_python_that_a_law_closes_over():
     """JAX differentiates it as such, and not as an array."""
 
     def height(rate):
-        arm = lx.rod("arm", length=2.0, mass=1.0)
-        hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
-        mechanism = lx.Mechanism([arm], [hinge], constraints=[lx.Drive("drive", "hinge", lambda t: rate * t)])
+        mechanism = pendulum(2.0, constraints=[lx.Drive("drive", "hinge", lambda t: rate * t)])
         state = lx.assemble(mechanism, t=0.5)
         return lx.Solution.of_state(mechanism, state, t=0.5).position("arm", at="tip")[-1, 1]
 
@@ -92,10 +91,7 @@ def test_fit_of_a_mass_alone():
     """That no loop depends on, with the state assembled inside of the residual."""
 
     def angle(params):
-        arm = lx.rod("arm", length=1.0, mass=params["mass"])
-        hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
-        forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointSpring("hinge", 20.0)]
-        mechanism = lx.Mechanism([arm], [hinge], forces)
+        mechanism = pendulum(mass=params["mass"], forces=[lx.JointSpring("hinge", 20.0)])
         return lx.simulate(mechanism, lx.assemble(mechanism, {"hinge": 0.4}), t1=1.0).joint("hinge")
 
     measured = angle({"mass": 1.3})

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import pendulum
 from scipy.integrate import solve_ivp
 
 import linkax as lx
@@ -209,10 +210,7 @@ def test_second_derivatives_forwards():
     gravity, t1, at = 9.81, 1.0, 0.9
 
     def angle(length):
-        arm = lx.rod("arm", length=length, mass=1.0)
-        hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
-        mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -gravity, 0.0])])
-        end = lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=t1, saveat=SAVE_END).end
+        end = lx.simulate(pendulum(length), lx.State(jnp.zeros(1), jnp.zeros(1)), t1=t1, saveat=SAVE_END).end
         return end.q[0], end.v[0]
 
     both = jax.jit(lambda length: (angle(length), jax.jacfwd(jax.jacfwd(angle))(length)))
@@ -230,10 +228,7 @@ slowly = lambda *modes: pytest.param(modes, marks=pytest.mark.slow)
 @pytest.mark.parametrize("modes", [slowly(jax.jacrev), slowly(jax.jacfwd), slowly(jax.jacfwd, jax.jacfwd)])
 def test_times_of_a_driven_joint(modes):
     """By the end of the run and by times at which it is saved, with rows that depend on time."""
-    arm = lx.rod("arm", 1.0, 1.0)
-    hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")
-    motor = lx.Drive("motor", "hinge", jnp.sin)
-    mechanism = lx.Mechanism([arm], [hinge], [lx.Gravity([0.0, -9.81, 0.0])], [motor])
+    mechanism = pendulum(constraints=[lx.Drive("motor", "hinge", jnp.sin)])
     start = lx.assemble(mechanism)
 
     def motion(t1, saved):

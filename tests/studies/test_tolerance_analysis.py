@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import four_bar
 from refusals import refused
 from scipy import stats
 
@@ -177,21 +178,13 @@ LENGTHS = {"crank": 0.4, "coupler": 0.55, "rocker": 0.9}
 
 def at_angle(params, angle):
     """A four-bar's rocker angle at an angle of its crank [rad], and whether it can be assembled there."""
-    crank, coupler = lx.rod("crank", params["crank"], 1.0), lx.rod("coupler", params["coupler"], 1.0)
-    rocker = lx.rod("rocker", params["rocker"], 1.0)
-    joints = [
-        lx.Revolute("crank_bearing", lx.GROUND, crank.at("base"), axis="z"),
-        lx.Revolute("rocker_bearing", lx.GROUND.at([1.0, 0.0, 0.0]), rocker.at("base"), axis="z"),
-        lx.Revolute("crank_pin", crank.at("tip"), coupler.at("base"), axis="z"),
-        lx.Revolute("rocker_pin", coupler.at("tip"), rocker.at("tip"), axis="z", cut=True),
-    ]
-    mechanism = lx.Mechanism([crank, coupler, rocker], joints)
+    mechanism = four_bar(params["crank"], params["coupler"], params["rocker"], cut="rocker_pin")
     guess = {"crank_pin": 0.8 - angle, "rocker_bearing": 2.6}
     here = lx.Solution.of_state(mechanism, lx.assemble(mechanism, {"crank_bearing": angle}, guess=guess))
     return {"rocker": here.joint("rocker_bearing")[0], "result": here.result}
 
 
-def four_bar(params):
+def at_angles(params):
     return jax.vmap(lambda angle: at_angle(params, angle))(ANGLES)
 
 
@@ -199,7 +192,7 @@ def four_bar(params):
 def test_a_four_bar_near_its_toggle_position():
     """Derivatives of the closed loop |d + c e^{iψ} − a e^{iφ}|² = b²; samples tell which order is right, some fail."""
     deviations = {name: 0.0087 for name in LENGTHS}
-    found = lx.tolerance_analysis(four_bar, LENGTHS, deviations, samples=4096, **QUIET)
+    found = lx.tolerance_analysis(at_angles, LENGTHS, deviations, samples=4096, **QUIET)
     a, b, c = (LENGTHS[name] for name in ("crank", "coupler", "rocker"))
     psi = np.asarray(found.first.mean["rocker"])
     to_tip = 1.0 + c * np.exp(1j * psi) - a * np.exp(1j * np.asarray(ANGLES))
