@@ -29,6 +29,7 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import Phase, settings  # noqa: E402
 from jax.experimental.compilation_cache import compilation_cache  # noqa: E402
+from xdist.scheduler import LoadScopeScheduling  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parent))
 from program_folder import forget_oldest, program_folder  # noqa: E402
@@ -70,14 +71,26 @@ def _group(path):
     return path.stem if found is None else found[1] or found[2]
 
 
+class ByGroup(LoadScopeScheduling):
+    """Give tests that share programs to one worker, as `--dist loadfile` does those of a file.
+
+    `--dist loadgroup` does not: pytest-xdist 3.8 writes the group into what pytest 9.2 does not read any more.
+    """
+
+    def _split_scope(self, nodeid):
+        return _group(self.config.rootpath / nodeid.partition("::")[0])
+
+
+def pytest_xdist_make_scheduler(config, log):
+    return ByGroup(config, log) if config.option.dist == "loadfile" else None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Give tests that share programs to one worker; the longest groups first, so that none is waited for at the end."""
+    """Begin with the longest groups, so that none is waited for at the end."""
     length = Counter()
     for path in {item.path for item in items}:
         length[_group(path)] += path.stat().st_size
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(_group(item.path)))
     items.sort(key=lambda item: (-length[_group(item.path)], _group(item.path)))
 
 
@@ -91,7 +104,12 @@ def _room_for_compiled_programs():
     """Forget programs before a file of tests where linkax would do so in the middle of it, with a warning."""
     if not memory_maps.has_room(MAPS_OF_A_FILE):
         jax.clear_caches()
+        gc.unfreeze()
         gc.collect()
+    yield
+    # What a file leaves is mostly programs in caches. To look through those of all files for garbage takes 7 s a time.
+    gc.collect(1)
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

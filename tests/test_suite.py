@@ -79,7 +79,7 @@ LAPACK, LAWS, GRADIENTS, COMMAND = TOUCHED = (
         (["src/linkax/model/bodies.py"], set(TOUCHED)),
         (["src/linkax/simulation/start/state.py"], {GRADIENTS, COMMAND}),
         (["src/linkax/cli/options.py", "tests/equations/test_laws.py"], {LAWS, COMMAND}),
-        (["tests/mechanisms.py"], {LAWS}),
+        (["tests/mechanisms.py"], {LAWS, GRADIENTS}),
         (["src/linkax/__init__.py"], {COMMAND}),
         ([], set()),
     ],

@@ -54,9 +54,10 @@ def test_nothing_is_known_of_what_is_computed_with_an_array():
 
 
 def test_what_is_known_is_forgotten_with_the_array():
+    before = {*known._remembered}  # of what other tests may hold
     traced(lambda a: lx.rod("rod", a, 1.0).frames["tip"], TRANSFORMATIONS["jit"])
     gc.collect()
-    assert not known._remembered
+    assert {*known._remembered} <= before
 
 
 @pytest.mark.slow
