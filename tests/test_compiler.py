@@ -34,10 +34,12 @@ def as_users_do():
     return _as_users_do("compiled_as_users_do.py")
 
 
+@pytest.mark.slow
 def test_importing_linkax_is_enough_for_kernels(as_users_do):
     assert as_users_do["makes_kernels"]
 
 
+@pytest.mark.slow
 def test_how_a_run_is_compiled_changes_nothing_but_rounding(as_users_do):
     one, other = as_users_do["motion"], motion()
     assert one["steps"] == other["steps"]

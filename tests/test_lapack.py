@@ -88,6 +88,7 @@ ANALYSES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ANALYSES)
 def test_analyses(name):
     mechanism = crank_slider(rod=1.6)

@@ -34,6 +34,9 @@ SLOW = tuple(
         "formulations",
         "beams",
         "internal_states",
+        "files",
+        "constraints",
+        "joints",
     )
 )
 mark = lambda name: [pytest.mark.slow] if name in SLOW else []

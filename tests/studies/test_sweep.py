@@ -94,6 +94,7 @@ def test_two_processes(whole, tmp_path):
         (tmp_path / "store" / "reason" / "c" / "9").unlink()
 
 
+@pytest.mark.slow
 def test_two_devices(whole, tmp_path):
     result = tmp_path / "result.npz"
     finished(started("-", result, devices=2))
