@@ -41,7 +41,8 @@ def pytest_runtest_teardown(item):
     taken = _used() - item.stash[BEGIN]
     item.user_properties.append((TIME, taken))
     most = float(item.config.getini("most_processor_time"))
-    if taken > most and not any(map(item.get_closest_marker, EXEMPT)) and taken > most * _slowness():
+    limited = not any(map(item.get_closest_marker, EXEMPT)) and not item.config.getoption("jaxtyping_packages", None)
+    if limited and taken > most and taken > most * _slowness():
         pytest.fail(
             f"took {taken:.1f} s of processor time, and a test may take {most:g}: share a mechanism of "
             "tests/mechanisms.py with others, so that less is compiled, or mark it slow",
