@@ -103,9 +103,8 @@ MAPS_OF_A_FILE = 15_000
 def _room_for_compiled_programs():
     """Forget programs before a file of tests where linkax would do so in the middle of it, with a warning."""
     if not memory_maps.has_room(MAPS_OF_A_FILE):
-        jax.clear_caches()
         gc.unfreeze()
-        gc.collect()
+        memory_maps.clear_caches()
     yield
     # What a file leaves is mostly programs in caches. To look through those of all files for garbage takes 7 s a time.
     gc.collect(1)

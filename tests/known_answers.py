@@ -20,12 +20,15 @@ def reference(name):
     return np.genfromtxt(Path(__file__).parent / "data" / f"{name}.csv", delimiter=",", names=True)
 
 
+def mechanism_of(name, variant=None, changes=None):
+    """Mechanism of a scene."""
+    return SCENES[name].mechanism(SCENES[name].settings(variant, changes))
+
+
 def start(name, variant=None, changes=None):
     """Mechanism and initial state of a scene."""
-    scene = SCENES[name]
-    settings = scene.settings(variant, changes)
-    mechanism = scene.mechanism(settings)
-    return mechanism, scene.initial(mechanism, settings)
+    mechanism = mechanism_of(name, variant, changes)
+    return mechanism, SCENES[name].initial(mechanism, SCENES[name].settings(variant, changes))
 
 
 def n_four_bar(times, count, gravity=9.81):

@@ -36,14 +36,16 @@ def pytest_configure(config):
 @pytest.hookimpl(trylast=True)  # of the tests that other options leave
 def pytest_collection_modifyitems(config, items):
     share, shares = map(int, (config.option.share or "0/1").split("/"))
-    touched = _touched_by(_changed(config.option.changed_since, config.rootpath))
+    touched = _touched_by(_changed(config.option.changed_since, config.rootpath), config.rootpath)
+    is_touched = {path: touched(path) for path in {_path(item) for item in items}}
     # Tests of this share come first, then those of the next, so that over many commits time is left for each.
     after = {item: (crc32(item.nodeid.partition("@")[0].encode()) - share) % shares for item in items}
-    first = sorted(filter(touched, items), key=after.get)
-    left = [item for item in items if after[item] and not touched(item)]
+    first = sorted((item for item in items if is_touched[_path(item)]), key=after.get)
+    others = [item for item in items if not is_touched[_path(item)]]
+    left = [item for item in others if after[item]]
     config.hook.pytest_deselected(items=left)
     config.stash[LEFT] = Counter(_path(item).as_posix() for item in left)
-    items[:] = first + [item for item in items if not after[item] and not touched(item)]
+    items[:] = first + [item for item in others if not after[item]]
 
 
 def _path(item):
@@ -59,13 +61,15 @@ def _changed(commit, root):
     return [Path(line) for line in told.stdout.splitlines()]
 
 
-def _touched_by(changed):
-    """Whether a change to files touches a test: its layer or one below, its own file, or what that imports of tests."""
+def _touched_by(changed, root):
+    """Whether a change touches the tests of a file: its layer or one below, the file, or what it imports of tests."""
+    if not changed:
+        return lambda path: False
     lowest = min((_layer_of(path) for path in changed if path.parts[0] == "src"), default=len(LAYERS) + 1)
     modules = "|".join(path.stem for path in changed if path.parts[0] == "tests")
     imports = re.compile(rf"^(from|import) ({modules or '(?!)'})\b", re.MULTILINE)
-    in_tests = lambda item: _path(item) in changed or bool(imports.search(item.path.read_text()))
-    return lambda item: _highest_layer(_path(item)) >= lowest or in_tests(item)
+    in_tests = lambda path: path in changed or bool(imports.search((root / path).read_text()))
+    return lambda path: _highest_layer(path) >= lowest or in_tests(path)
 
 
 def _layer_of(path):

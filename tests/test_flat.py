@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from known_answers import mechanism_of
 
 import linkax as lx
-from linkax.scenes import SCENES
 from linkax.straight_line.known import KnownEntries, flat_with_known
 from linkax.xla.flat import Flat
 
@@ -19,11 +19,6 @@ TREE = {"masses": np.array([1.0, 2.0]), "name": "rod", "of": (jnp.ones(3), None,
 
 class Numbers(eqx.Module):
     numbers: np.ndarray
-
-
-def _mechanism():
-    scene = SCENES["crank-slider"]
-    return scene.mechanism(scene.settings())
 
 
 def test_tree_is_what_it_was_made_of():
@@ -63,7 +58,7 @@ def test_compiles_again_only_for_another_static_part():
 
 
 def test_pickles():
-    mechanism = _mechanism()
+    mechanism = mechanism_of("crank-slider")
     flat = flat_with_known(mechanism)
     again = pickle.loads(pickle.dumps(flat))
     assert eqx.tree_equal(again, flat)
@@ -71,7 +66,7 @@ def test_pickles():
 
 
 def test_kept_as_long_as_the_mechanism_lives():
-    mechanism = _mechanism()
+    mechanism = mechanism_of("crank-slider")
     first = flat_with_known(mechanism)
     assert flat_with_known(mechanism) is first
     heavier = eqx.tree_at(lambda m: m.bodies[0].mass, mechanism, mechanism.bodies[0].mass + 1.0)
@@ -84,8 +79,7 @@ def test_kept_as_long_as_the_mechanism_lives():
 
 def test_traced_mechanisms_are_not_kept():
     def of(mass):
-        scene = SCENES["crank-slider"]
-        mechanism = scene.mechanism(scene.settings(changes={"rod_mass": mass}))
+        mechanism = mechanism_of("crank-slider", changes={"rod_mass": mass})
         assert flat_with_known(mechanism) is not flat_with_known(mechanism)
         return mass
 
@@ -93,7 +87,7 @@ def test_traced_mechanisms_are_not_kept():
 
 
 def test_solution_has_the_mechanism():
-    mechanism = _mechanism()
+    mechanism = mechanism_of("crank-slider")
     solution = lx.Solution.of_state(mechanism, lx.assemble(mechanism))
     assert eqx.tree_equal(solution.mechanism, mechanism)
 

@@ -6,16 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from known_answers import mechanism_of
 from mechanisms import POOL
 
 import linkax as lx
-from linkax.scenes import SCENES
 from linkax.tables import MOST_ROWS, SMALL, Rows, Table, numbers
-
-
-def mechanism_of(name, variant=None):
-    scene = SCENES[name]
-    return scene.mechanism(scene.settings(variant))
 
 
 def at_zero(mechanism):

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from jax.experimental.compilation_cache import compilation_cache
 from mechanisms import crank_slider
 
 import linkax as lx
@@ -124,7 +125,9 @@ def test_kept_programs_call_lapack(tmp_path):
 
 @pytest.fixture
 def kept_in(tmp_path):
-    """A folder for programs of this process, of which it forgets all afterwards."""
+    """A folder for programs of this process, of which it forgets all afterwards; JAX keeps and finds none."""
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()  # which is open where tests keep theirs
     kept_programs.keep_in(tmp_path)
     yield tmp_path / "linkax"
     kept_programs._met.clear()

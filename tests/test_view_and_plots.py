@@ -13,6 +13,7 @@ import diffrax
 import numpy as np
 import pytest
 import trimesh
+from known_answers import start
 from PIL import Image
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -70,10 +71,7 @@ def swaying(mechanism, state, count=41):
 
 
 def scene(name):
-    found = SCENES[name]
-    parameters = found.settings()
-    mechanism = found.mechanism(parameters)
-    return mechanism, found.initial(mechanism, parameters), found.points(parameters)
+    return *start(name), SCENES[name].points(SCENES[name].settings())
 
 
 @pytest.fixture(scope="module")

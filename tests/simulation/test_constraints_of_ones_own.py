@@ -103,6 +103,13 @@ def test_its_derivatives():
     np.testing.assert_allclose(found, central, rtol=1e-6)
 
 
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
+def test_derivatives_of_its_assembly(derivative):
+    """y = x² / (2 r), where x is given."""
+    height = lambda radius: lx.assemble(on_parabola(radius), {("table", 0): 0.4}).q[1]
+    np.testing.assert_allclose(derivative(height)(0.5), -(0.4**2) / (2.0 * 0.5**2), rtol=1e-9)
+
+
 def test_a_bead_on_a_turning_line():
     """r̈ = ω² r: away from the axis by cosh; the reaction is 2 m ω ṙ, and its power all that the energy gains."""
     bead = lx.point_mass("bead", 2.0)

@@ -5,18 +5,17 @@ import jax.numpy as jnp
 import mechanisms
 import numpy as np
 import pytest
+from known_answers import mechanism_of
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import neutral, retract
 from linkax.equations.system import system_of
 from linkax.model.terms import Term
-from linkax.scenes import SCENES
 from linkax.simulation.start.joint_values import JointValues
 
 
 def _row_of_four_bars(_seed):
-    scene = SCENES["n-four-bar"]
-    return scene.mechanism(scene.settings(None, {"N": 6}))
+    return mechanism_of("n-four-bar", changes={"N": 6})
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from known_answers import start
+from known_answers import mechanism_of, start
 
 import linkax as lx
 from linkax.equations.structure import structure_of
@@ -20,8 +20,7 @@ SETTINGS = {"N": COUNT, "angle": 0.0, "speed": -2.0}
 @pytest.fixture(scope="module")
 def row():
     """A row of four-bars with every right joint twice, all links in line."""
-    scene = SCENES["n-four-bar"]
-    mechanism = scene.mechanism(scene.settings("A02", SETTINGS))
+    mechanism = mechanism_of("n-four-bar", "A02", SETTINGS)
     tip = {body.name: body.at("tip") for body in mechanism.bodies}
     again = [lx.Spherical(f"again_{i}", tip[f"coupler_{i}"], tip[f"link_{i}"]) for i in range(1, COUNT + 1)]
     return lx.Mechanism(mechanism.bodies, [*mechanism.joints, *again], mechanism.forces)

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from known_answers import mechanism_of
 from mechanisms import crank_slider, pendulum
 
 import linkax as lx
 from linkax.cli import progress_run
-from linkax.scenes import SCENES
 from linkax.simulation.read.observables import Observables
 from linkax.xla.program import Program
 
@@ -185,8 +185,7 @@ def test_every_step_saved_is_read_and_no_room_beyond():
 
 
 def test_a_state_that_does_not_close_is_refused():
-    scene = SCENES["crank-slider"]
-    mechanism = scene.mechanism(scene.settings(changes={"rod": 0.2}))
+    mechanism = mechanism_of("crank-slider", changes={"rod": 0.2})
     with pytest.raises(lx.SimulationError, match=r"loops of the initial state do not close.*assemble"):
         lx.simulate(mechanism, lx.State(jnp.array([1.5, 0.5, 0.5]), jnp.zeros(3)), t1=5.0)
 

@@ -5,18 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from known_answers import reference, rise_of_sarrus
+from known_answers import mechanism_of, reference, rise_of_sarrus
 from mechanisms import raised, raised_exactly, sarrus
 from scipy.optimize import brentq
 from scipy.special import ellipeinc
 
 import linkax as lx
 from linkax.scenes import SCENES
-
-
-def crank_slider(variant):
-    scene = SCENES["crank-slider"]
-    return scene.mechanism(scene.settings(variant))
 
 
 class FreeCrankSlider:
@@ -29,7 +24,7 @@ class FreeCrankSlider:
 
     def __init__(self, angles, directions):
         self.angles, self.speeds = angles, directions * np.sqrt(2.0 / (2.0 / 3.0 + 6.0 * np.sin(angles) ** 2))
-        mechanism = crank_slider("SC2")
+        mechanism = mechanism_of("crank-slider", "SC2")
         coordinates = {"bearing": angles, "crank_pin": -2.0 * angles, "guide": 2.0 * np.cos(angles)}
         rates = {
             "bearing": self.speeds,
@@ -98,7 +93,7 @@ Q_UPRIGHT = np.array([np.pi / 2, 0.0, -np.pi])
 
 
 def upright(speeds):
-    mechanism = crank_slider("SC1")
+    mechanism = mechanism_of("crank-slider", "SC1")
     return mechanism, lx.assemble(mechanism, UPRIGHT, speeds, guess={"crank_pin": -np.pi})
 
 
@@ -154,17 +149,18 @@ def test_speeds_on_no_branch_are_found_out():
         upright({"bearing": 1.0, "crank_pin": -1.0})
     between = lx.State(Q_UPRIGHT, np.array([1.0, -1.0, -1.0]))
     with pytest.raises(lx.SimulationError, match=r"before it began.*no branch.*'guide'") as failure:
-        lx.simulate(crank_slider("SC1"), between, t1=0.5)
+        lx.simulate(mechanism_of("crank-slider", "SC1"), between, t1=0.5)
     assert failure.value.solution.result == lx.RESULTS.no_branch
 
 
 def test_a_start_at_rest_that_is_not_unique_is_found_out():
     state = lx.State(Q_UPRIGHT, np.zeros(3))
     with pytest.raises(lx.SimulationError, match=r"at rest in a singular.*not unique.*'bearing'") as failure:
-        lx.simulate(crank_slider("SC1"), state, t1=0.5)
+        lx.simulate(mechanism_of("crank-slider", "SC1"), state, t1=0.5)
     assert failure.value.solution.result == lx.RESULTS.not_unique
     # Without forces it stays, and that is unique.
-    assert np.ptp(lx.simulate(crank_slider("SC2"), state, t1=0.5).q, axis=0) == pytest.approx(0.0, abs=1e-15)
+    at_rest = lx.simulate(mechanism_of("crank-slider", "SC2"), state, t1=0.5)
+    assert np.ptp(at_rest.q, axis=0) == pytest.approx(0.0, abs=1e-15)
 
 
 @pytest.mark.slow

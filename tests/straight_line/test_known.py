@@ -5,16 +5,15 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from known_answers import mechanism_of
 
 from linkax.equations.system import system_of
-from linkax.scenes import SCENES
 from linkax.straight_line.known import KnownEntries, KnowsEntries, patterns_of
 from linkax.straight_line.transform import straight_line
 
 
 def crank_slider(**changes):
-    scene = SCENES["crank-slider"]
-    return scene.mechanism(scene.settings(changes=changes))
+    return mechanism_of("crank-slider", changes=changes)
 
 
 def test_the_same_zeros_are_the_same_program():

@@ -38,9 +38,7 @@ def make_room(event: str = COMPILING, *_time: Any, **_what: Any) -> None:
         return
     if has_room():
         return
-    for clear in CACHES:
-        clear()
-    gc.collect()
+    clear_caches()
     limit = _limit_of_maps()
     remedy = f"raise their limit (sysctl -w vm.max_map_count={4 * limit})"
     if not has_room():
@@ -53,6 +51,13 @@ def make_room(event: str = COMPILING, *_time: Any, **_what: Any) -> None:
         f"been cleared, and what is used again compiles again; to keep more programs {remedy}",
         RuntimeWarning,
     )
+
+
+def clear_caches() -> None:
+    """Let go of all compiled programs that are not in use."""
+    for clear in CACHES:
+        clear()
+    gc.collect()
 
 
 def has_room(more: int = 0) -> bool:
