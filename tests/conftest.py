@@ -39,17 +39,17 @@ from linkax.xla.kept_programs import keep_in  # noqa: E402
 
 pytest_plugins = ["annotations", "processor_time", "slow_tests"]
 
-# What one test has compiled, in this run or an earlier one, the next one reads; so do processes that tests start.
-KEPT_FROM = 0.05  # to compile [s]; what takes less is hardly read sooner than it is compiled
+# What one test has compiled, in this run or an earlier one, the next one reads; so do processes that tests start. Small
+# programs, too, of which there are thousands: to read one takes 7 ms, to compile it 25 ms.
 if not AS_USERS_DO and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     folder = program_folder()
     forget_oldest(folder)
     os.environ |= {
         "JAX_COMPILATION_CACHE_DIR": str(folder),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(KEPT_FROM),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", KEPT_FROM)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # The same examples in each run; `--hypothesis-profile thorough` takes many others, and makes failing ones small.
 _quick = [Phase.explicit, Phase.generate]

@@ -45,7 +45,18 @@ def test_inspect_tells_loops_freedoms_and_what_is_left_out(file, capsys):
     assert "cut  Revolute 'pin': coupler - rocker" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("held", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_simulate_takes_a_file_of_a_tree(capsys, tmp_path):
+    rod, axis = LINK.format(name="rod", at="0 0 0.5"), '<axis xyz="0 1 0"/>'
+    hinge = f'<joint name="hinge" type="continuous"><parent link="frame"/><child link="rod"/>{axis}</joint>'
+    (tmp_path / "rod.urdf").write_text(f'<robot name="rod"><link name="frame"/>{rod}{hinge}</robot>')
+    settings = ["--t1", "0.3", "--preset", "draft", "--no-plots", "--json", "--hold", "hinge=0.2"]
+    assert run(["simulate", str(tmp_path / "rod.urdf"), *settings, "--out", str(tmp_path / "out")]) == 0
+    told = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(told["final"]["rod"], [0.5 * np.sin(0.2), 0.0, 0.5 * np.cos(0.2)], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("held", [True, False])
 def test_simulate_takes_a_file(held, file, capsys, tmp_path):
     settings = ["--t1", "0.3", "--preset", "draft", "--no-plots", "--json", "--set", "bodies.crank.mass=2"]
     hold = ["--hold", "crank_bearing=0.2"] if held else []

@@ -50,6 +50,7 @@ def test_the_test_sees_them():
     assert batched_calls(jax.vmap(jnp.linalg.cholesky), jnp.stack([jnp.eye(3)] * COUNT))
 
 
+@pytest.mark.slow
 def test_passages(large):
     mechanism, state = large
     pairs = (jnp.tile(part, (COUNT, 2, 1)) for part in (state.q, state.v))

@@ -15,8 +15,8 @@ FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted([*FOLDER.glob("*.ipynb"), *FOLDER.glob("gallery/*.ipynb")])
 
 
-QUICK = ("method",)  # the others are minutes of compiling
-mark = lambda path: [] if path.stem in QUICK else [pytest.mark.slow]
+QUICK = ("method",)  # which `.ci/run` always runs, with the settings that users have; the others compile for minutes
+mark = lambda path: pytest.mark.users_settings if path.stem in QUICK else pytest.mark.slow
 MARKED = [pytest.param(path, marks=mark(path), id=path.stem) for path in NOTEBOOKS]
 
 

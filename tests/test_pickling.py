@@ -100,6 +100,7 @@ def test_a_solution_that_arrived_is_read_like_the_one_sent():
     assert same(arrived(dense).evaluate(0.5), dense.evaluate(0.5))
 
 
+@pytest.mark.slow
 def test_the_error_of_a_worker_process_comes_with_its_solution():
     pool = concurrent.futures.ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
     try:

@@ -17,6 +17,7 @@ def opened(monkeypatch):
     return opened
 
 
+@pytest.mark.users_settings
 def test_its_first_block_makes_what_it_says(opened):
     PAGE.run(1)
     assert opened[0].startswith("file:")
@@ -25,11 +26,8 @@ def test_its_first_block_makes_what_it_says(opened):
     assert PAGE.names["solution"].worst_violation().position < 1e-13
 
 
-# What takes derivatives of a run compiles for long; `.ci/run` runs it with the settings that users have.
-LONG = [pytest.param(count, marks=pytest.mark.users_settings) for count in range(3, len(blocks(PAGE.path)) + 1)]
-
-
-@pytest.mark.parametrize("count", [2, *LONG])
+@pytest.mark.users_settings
+@pytest.mark.parametrize("count", range(2, len(blocks(PAGE.path)) + 1))
 def test_the_other_blocks_run(count):
     PAGE.run(count)
 

@@ -39,7 +39,7 @@ SLOW = tuple(
         "joints",
     )
 )
-mark = lambda name: [pytest.mark.slow] if name in SLOW else []
+mark = lambda name: pytest.mark.slow if name in SLOW else pytest.mark.users_settings
 
 
 def test_every_public_name_is_on_one_page():
@@ -69,12 +69,14 @@ def of_forces(name):
     return forces.names[name]
 
 
+@pytest.mark.users_settings
 def test_a_force_of_ones_own():
     here = lx.Solution.of_state(of_forces("dragged"), lx.State(jnp.zeros(1), jnp.array([3.0])))
     # J θ'' of a rod of length and mass one about its end, under drag at its tip.
     np.testing.assert_allclose(here.acceleration("arm", at="tip")[0, 1], -0.1 * 3.0**2 * 3.0, rtol=1e-12)
 
 
+@pytest.mark.users_settings
 def test_a_force_with_a_switch():
     for angle in (0.1, -0.1):
         here = lx.Solution.of_state(of_forces("buffered"), lx.State(jnp.array([angle]), jnp.zeros(1)))

@@ -86,6 +86,7 @@ def _code(path):
     return "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
 
 
+@pytest.mark.slow
 def test_right_programs_are_let_pass(told):
     assert {name: errors for name, errors in told.items() if errors and name != "wrong"} == {}
 

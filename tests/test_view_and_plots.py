@@ -143,7 +143,7 @@ def test_crank_slider_renders_plays_and_tells_names(browser, crank_slider, tmp_p
         assert shown.page.locator("#tip").text_content() == label
 
 
-@pytest.mark.parametrize("name", ["bricard", "stewart"])
+@pytest.mark.parametrize("name", ["bricard", pytest.param("stewart", marks=pytest.mark.slow)])
 def test_bodies_are_where_the_solution_says(name, browser, tmp_path):
     mechanism, state, points = (*stewart_platform(), {}) if name == "stewart" else scene(name)
     solution = swaying(mechanism, state)

@@ -96,7 +96,8 @@ def test_derivative_of_an_equilibrium_and_of_a_frequency():
     np.testing.assert_allclose(jax.grad(lambda k: stretched(k)[0])(30.0), found[0], rtol=1e-9)
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
 def test_derivatives_of_modes_and_frequencies(order):
     """And they: of two bodies on one guide, the first between wall and spring, the second behind the spring."""
 

@@ -189,13 +189,14 @@ def test_refinement_with_factors_of_a_system_nearby(name):
     inverse = both(given, "mass")[1]
     unknowns = np.random.default_rng(1).normal(size=len(given.mass) + len(given.jacobian))
     whole = np.block([[given.mass, -given.jacobian.T], [given.jacobian, np.zeros(2 * given.jacobian.shape[:1])]])
-    product = product_of(given)
+    product = eqx.filter_jit(product_of(given))
     np.testing.assert_allclose(product(unknowns), whole @ unknowns, atol=1e-12)
     changed = given._replace(mass=1.001 * given.mass, jacobian=0.999 * given.jacobian, rate=0.999 * given.rate)
     at_once, _ = both(changed, "mass")
-    found, _ = constrained_solve(
+    refined = lambda inverse: constrained_solve(
         inverse, changed.mass, changed.jacobian, changed.force, changed.rate, 4, product_of(changed)
     )
+    found, _ = eqx.filter_jit(refined)(inverse)
     np.testing.assert_allclose(found, at_once.apply(changed.force, changed.rate)[0], atol=1e-9)
 
 

@@ -33,6 +33,7 @@ def test_cassie_closes_its_loops(name):
     check_loops(cassie(name).mechanism(), *CASSIE[name])
 
 
+@pytest.mark.slow
 def test_a_leg_of_cassie_closes_its_loops():
     both = cassie("cassie_v2").mechanism()
     left = lambda parts: [part for part in parts if not part.name.startswith("right")]

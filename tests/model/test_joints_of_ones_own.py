@@ -68,6 +68,7 @@ def closed(radius):
     return lx.Mechanism([arm, bead], joints, [lx.Gravity([0.0, 0.0, -9.81])])
 
 
+@pytest.mark.slow
 def test_in_a_loop():
     mechanism = closed(0.3)
     state = lx.assemble(mechanism, {"wire": 7.0})

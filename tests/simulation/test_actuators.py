@@ -145,13 +145,8 @@ def test_oil_that_flows_in_is_compressed_displaced_or_leaks():
         assert np.max(np.abs(oil - oil[0])) > 1e-2 * oil[0]
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param(lx.HydraulicCylinder, id="between-points"),
-        pytest.param(lx.HydraulicActuator, id="along-a-slide", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [lx.HydraulicCylinder, lx.HydraulicActuator], ids=["between-points", "along-a-slide"])
 def test_a_load_on_locked_oil_swings_as_on_a_spring(kind):
     """A step of force: x = F / K (1 − cos ω t), with ω² = K / m."""
     mechanism, state = cylinder(0.0, kind, force=100.0)
@@ -162,6 +157,7 @@ def test_a_load_on_locked_oil_swings_as_on_a_spring(kind):
     np.testing.assert_allclose(solution.q[:, 0] - 0.7, moved, atol=1e-3 * 200.0 / STIFFNESS)
 
 
+@pytest.mark.slow
 def test_a_controlled_cylinder_is_behind_a_ramp_by_its_speed_over_the_gain():
     """The opening is gain × what it is behind, over the speed at which the valve is fully open."""
     speed, full = 0.05, 1e-7 * (2e7 / 2.0) ** 0.5 / 2e-3

@@ -61,6 +61,7 @@ def test_a_servo_at_its_limit_and_below():
     np.testing.assert_allclose(found.work()["servo"], MASS * v**2 / 2.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_servo_that_leaves_its_limit():
     def end(numbers):
         found = servo(numbers, diffrax.SaveAt(t1=True)).end

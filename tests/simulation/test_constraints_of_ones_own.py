@@ -97,6 +97,7 @@ def derivatives(radius):
     return value, forwards(1.0), *jax.linear_transpose(forwards, radius)(1.0)
 
 
+@pytest.mark.slow
 def test_its_derivatives():
     step, (_, *found) = 1e-5, derivatives(0.5)
     central = (derivatives(0.5 + step)[0] - derivatives(0.5 - step)[0]) / (2.0 * step)

@@ -41,7 +41,11 @@ def twice(found):
     return found, found
 
 
-@in_both_modes
+@pytest.mark.parametrize(
+    ("adjoint", "derivative"),
+    [pytest.param(*MODES[0], marks=pytest.mark.slow), MODES[1]],
+    ids=["backwards", "forwards"],
+)
 def test_root_of_an_event_against_the_closed_form(adjoint, derivative):
     """½ T t² = 2: t = 2 / √T, and the speed there is 2 √T."""
 

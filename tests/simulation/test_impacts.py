@@ -72,6 +72,7 @@ def differences(function, x):
     return np.stack([(8.0 * rise(e) - rise(2.0 * e)) / (12.0 * STEP) for e in STEP * np.eye(len(x))], axis=-1)
 
 
+@pytest.mark.slow
 def test_derivatives_through_ten_impacts():
     """Forwards and backwards, against those of the closed form."""
 

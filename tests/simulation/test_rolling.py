@@ -93,6 +93,7 @@ def test_a_disc_rolls_steadily():
     assert solution.worst_violation().position < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_a_disc_rolls_upright_from_a_speed_on(share):
     """Upright it is stable where ω² > A m g r / (C (C + m r²)), of a uniform thin disc g / (3 r)."""

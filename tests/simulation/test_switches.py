@@ -132,6 +132,7 @@ def swing(numbers, rtol):
     return jax.jvp(end, (numbers,), (numbers,))
 
 
+@pytest.mark.slow
 def test_orders_and_derivatives_across_kinks_and_jumps():
     """Values and derivatives come nearer as fast as the tolerance falls."""
     numbers, step = jnp.array([100.0, 70.0, 3.0, 1.0]), 1e-3

@@ -189,7 +189,7 @@ def test_experiments_of_a_kind_are_one_batch(known, motion):
     np.testing.assert_allclose(held_out[0]["encoder"], values[1], rtol=1e-6)
 
 
-@pytest.mark.parametrize("loss", ["squares", "huber"])
+@pytest.mark.parametrize("loss", ["squares", pytest.param("huber", marks=pytest.mark.slow)])
 def test_profiles_of_experiments_are_those_of_their_covariance(known, loss):
     """Of sensors that are linear; of a robust loss near the fit, where its curvature tells less than its scatter."""
     values = told(known, 0, 0.0 if loss == "squares" else 0.1)

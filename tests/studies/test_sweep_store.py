@@ -285,9 +285,9 @@ def both():
         yield lambda stores, *factors: [task.result() for task in [pool.submit(race, stores, x) for x in factors]]
 
 
-@pytest.mark.parametrize("rounds", [3, pytest.param(20, marks=pytest.mark.slow)])
-def test_two_processes_that_share_stores(both, rounds, tmp_path):
-    stores = [tmp_path / str(number) for number in range(rounds)]
+@pytest.mark.slow
+def test_two_processes_that_share_stores(both, tmp_path):
+    stores = [tmp_path / str(number) for number in range(20)]
     for found in both(stores, 1.0, 1.0):
         np.testing.assert_array_equal(found, len(stores) * [np.sin(PARAMS["a"])])
     for store in stores:
@@ -296,6 +296,7 @@ def test_two_processes_that_share_stores(both, rounds, tmp_path):
         assert np.isnan(again.seconds_per_member)
 
 
+@pytest.mark.slow
 def test_two_sweeps_do_not_share_a_store(both, tmp_path):
     """Of those that start at once, one has it, and the other is refused."""
     stores = [tmp_path / str(number) for number in range(5)]

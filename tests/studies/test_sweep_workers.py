@@ -111,6 +111,7 @@ def until(condition):
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_dask_worker_killed_and_one_that_joins_late(dask, tmp_path):
     """After ten chunks all workers hold one more; one of them is killed, and the others wait for one that joins."""
     executor = Noting(dask.client.get_executor(), tmp_path)
