@@ -1,9 +1,10 @@
-"""The tests that check annotations: one of each file, and all of the files in which no motion is simulated.
+"""The tests that check annotations: one of each file, and all of the files in which nothing large is compiled.
 
 Other runs leave annotations alone, as to check them takes two fifths of the time: `pytest -m annotations
 --jaxtyping-packages=linkax,beartype.beartype` is the one that does not.
 """
 
+import re
 from contextlib import contextmanager
 from functools import cache
 
@@ -35,9 +36,12 @@ def pytest_configure(config):
         pytest.raises = _raises_unchecked
 
 
+COMPILES = re.compile("simulate|assemble|jit")
+
+
 @cache
 def _is_quick(path):
-    return "simulate" not in path.read_text()
+    return not COMPILES.search(path.read_text())
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -1,10 +1,13 @@
-"""A mechanism's state in MuJoCo's coordinates, and what both compute of its tree."""
+"""Machines beside MuJoCo: states in its coordinates, and what both compute of a tree; loops, which no tree has."""
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import linkax as lx
 from linkax.equations.configuration import configure
 from linkax.equations.dynamics import generalised_force, mass_matrix
 from linkax.equations.motion import move
@@ -15,6 +18,21 @@ FREE, BALL = (kind.value for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoin
 
 def rotation(quaternion):
     return Rotation.from_quat(quaternion, scalar_first=True)
+
+
+def random_state(mechanism, rng):
+    topology = mechanism.topology
+    q = rng.normal(size=topology.num_coordinates)
+    for start, _ in topology.quaternions:
+        q[start : start + 4] /= np.linalg.norm(q[start : start + 4])
+    return lx.State(jnp.asarray(q), jnp.asarray(rng.normal(size=topology.num_speeds)), topology)
+
+
+def state_of(mechanism, start):
+    """The state at a start that a file names, of joints in the tree alone."""
+    order = mechanism.topology.coordinates
+    flat = lambda given: np.concatenate([np.atleast_1d(given[name]) for name in order if name in given])
+    return lx.State(jnp.asarray(flat(start.positions)), jnp.asarray(flat(start.speeds)), mechanism.topology)
 
 
 def positions(model, mechanism, names, q):
@@ -57,3 +75,12 @@ def tree_dynamics(mechanism, state):
     configuration = configure(system_of(mechanism, np.float64), 0.0, state.q)
     motion = move(configuration, state.v)
     return mass_matrix(configuration), generalised_force(motion), configuration.world_center_of_mass()
+
+
+def check_loops(mechanism, expected, state=None):
+    """Numbers of loops, degrees of freedom and redundant rows; and loops closed at a state, or else at a found one."""
+    state = lx.assemble(mechanism) if state is None else state
+    found = lx.mobility(mechanism, state)
+    assert (mechanism.topology.num_cuts, found.degrees_of_freedom, found.num_redundant) == expected
+    open_by = eqx.filter_jit(lambda state: lx.Solution.of_state(mechanism, state).worst_violation().position)
+    assert open_by(state) < 1e-12

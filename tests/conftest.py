@@ -3,6 +3,7 @@
 `annotations` and `slow_tests` say which run, `processor_time` how long they take.
 """
 
+import ctypes
 import gc
 import os
 import re
@@ -97,14 +98,28 @@ def pytest_collection_modifyitems(items):
 # Compiled programs hold memory maps, of which Linux gives a process 65 530 unless it is told otherwise. Programs of the
 # largest file of tests take fewer than these.
 MAPS_OF_A_FILE = 15_000
+MEMORY_OF_A_FILE = 3e9  # [bytes]; even the smallest program takes 1.4 MB
+
+
+def _memory_left():
+    """What the machine can still give [bytes], infinite where it does not tell."""
+    try:
+        return 1024.0 * int(re.search(r"MemAvailable: +(\d+) kB", Path("/proc/meminfo").read_text())[1])
+    except OSError:
+        return float("inf")
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _room_for_compiled_programs():
-    """Forget programs before a file of tests where linkax would do so in the middle of it, with a warning."""
-    if not memory_maps.has_room(MAPS_OF_A_FILE):
+    """Forget programs before a file of tests that the machine may have no memory for, or no maps.
+
+    Where maps run out in the middle of a file, linkax forgets programs with a warning.
+    """
+    if not memory_maps.has_room(MAPS_OF_A_FILE) or _memory_left() < MEMORY_OF_A_FILE:
         gc.unfreeze()
         memory_maps.clear_caches()
+        if sys.platform == "linux":
+            ctypes.CDLL(None).malloc_trim(0)  # the C library keeps what is freed
     yield
     # What a file leaves is mostly programs in caches. To look through those of all files for garbage takes 7 s a time.
     gc.collect(1)

@@ -64,7 +64,7 @@ def chain_of_beams(parameters):
 
 
 def rigid(parameters):
-    """The crane, planar, with rigid sections in straight guides."""
+    """The crane, planar, with rigid sections in straight guides, and its start at rest."""
     flexible = SCENE.mechanism(parameters)
     sections = []
     for index in (1, 2, 3):
@@ -91,14 +91,10 @@ def rigid(parameters):
         telescoping,
         lx.Rope(rope.name, [above(first, SECTION - END), above(second, SECTION - END), above(third, END)], rope.length),
     ]
-    return lx.Mechanism([turntable, *sections, payload], joints, flexible.forces[:1], constraints)
-
-
-def at_rest(mechanism, parameters):
-    """The rigid crane at the start."""
+    mechanism = lx.Mechanism([turntable, *sections, payload], joints, flexible.forces[:1], constraints)
     angle, extension = parameters["angle"], parameters["extension"]
     guess = {"pivot": angle, "hook": -angle, "extension_2": extension, "extension_3": extension}
-    return lx.equilibrium(mechanism, lx.assemble(mechanism, guess=guess))
+    return mechanism, lx.equilibrium(mechanism, lx.assemble(mechanism, guess=guess))
 
 
 def slopes_and_differences(**changes):

@@ -8,12 +8,12 @@ import json
 import mmap
 import warnings
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from compilations import compilations
+from mechanisms import pendulum
 
 import linkax as lx
-from linkax.xla.memory_maps import COMPILING
 
 UNLIKE, REBUILT = 60, 2000
 HELD = 48_000  # memory maps, so that those left are used up several times
@@ -40,10 +40,8 @@ def end(mechanism):
 
 def driven(speed):
     """The speed of an arm with a drive and a torque by functions made anew."""
-    arm = lx.rod("arm", 1.0, 1.0)
     torque = lx.JointTorque("hinge", lambda t, motion: speed * jnp.cos(t))
-    hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")
-    mechanism = lx.Mechanism([arm], [hinge], [torque])
+    mechanism = pendulum(gravity=0.0, forces=[torque])
     return float(lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=1.0).v[-1, 0])
 
 
@@ -55,11 +53,9 @@ if __name__ == "__main__":
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         ends = [end(mechanism) for mechanism in [*unlike, unlike[0]]]
-        programs = []
-        note = lambda event, _, **what: programs.append(what) if event == COMPILING else None
-        jax.monitoring.register_event_duration_secs_listener(note)
         speeds = np.linspace(0.0, 2.0, REBUILT)
-        errors = [driven(jnp.asarray(speed)) - 3.0 * speed * np.sin(1.0) for speed in speeds]
+        with compilations() as programs:
+            errors = [driven(jnp.asarray(speed)) - 3.0 * speed * np.sin(1.0) for speed in speeds]
     found = {
         "unlike": len(unlike),
         "cleared": sum("memory maps" in str(warning.message) for warning in told),

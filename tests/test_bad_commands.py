@@ -82,15 +82,8 @@ def test_a_bad_parameter_is_named(command, capsys, folder):
         known = data.draw(st.sampled_from(sorted(SCENES[scene].parameters)))
         unknown = data.draw(not_one_of(SCENES[scene].parameters).filter(lambda text: "=" not in text))
         value = data.draw(st.sampled_from([*NO_NUMBER, "1.0.0"]))
-        change, words = data.draw(
-            st.sampled_from(
-                [
-                    (f"{known}={value}", (repr(known), repr(value))),
-                    (f"{unknown}=1", ("no parameter",)),
-                    (known, ("NAME=VALUE",)),
-                ]
-            )
-        )
+        wrong = (f"{known}={value}", (repr(known), repr(value))), (f"{unknown}=1", ("no parameter",))
+        change, words = data.draw(st.sampled_from([*wrong, (known, ("NAME=VALUE",))]))
         refused([command, scene, f"--set={change}"], capsys, folder, *words)
 
     check()

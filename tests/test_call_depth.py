@@ -1,7 +1,9 @@
 """A formula of the method is a few calls away from `simulate`."""
 
 import sys
+from itertools import takewhile
 from pathlib import Path
+from traceback import walk_stack
 
 import pytest
 
@@ -22,17 +24,11 @@ def depths():
         formula = getattr(owner, name)
 
         def counted(*args, **options):
-            frame, count = sys._getframe(1), 0
-            while frame is not None and frame.f_code.co_name != "simulate":
-                count += frame.f_code.co_filename.startswith(SOURCE)
-                frame = frame.f_back
+            codes = [frame.f_code for frame, _ in walk_stack(sys._getframe(1))]
+            below = takewhile(lambda code: code.co_name != "simulate", codes)
             # Checks of the start, and readings, have programs of their own.
-            names, above = [], sys._getframe(1)
-            while above is not None:
-                names.append(above.f_code.co_name)
-                above = above.f_back
-            if "_integrate" in names:
-                found.setdefault(name, count)
+            if "_integrate" in [code.co_name for code in codes]:
+                found.setdefault(name, sum(code.co_filename.startswith(SOURCE) for code in below))
             return formula(*args, **options)
 
         patch.setattr(owner, name, counted)

@@ -81,11 +81,15 @@ sys.exit(code)
 """
 
 
+def asked(*arguments):
+    """What another Python ended with and printed."""
+    environment = os.environ | {"PYTHONPATH": str(Path(linkax_command.__file__).parents[1])}
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment, check=False)
+
+
 @pytest.mark.parametrize("command", LIGHT)
 def test_what_computes_nothing_does_not_wait_for_jax(command):
-    environment = os.environ | {"PYTHONPATH": str(Path(linkax_command.__file__).parents[1])}
-    asked = [sys.executable, "-c", ANSWER, *command.split()]
-    found = subprocess.run(asked, capture_output=True, text=True, env=environment, check=False)
+    found = asked("-c", ANSWER, *command.split())
     code, words = LIGHT[command]
     assert found.returncode == code
     assert words in (found.stderr if code else found.stdout)
@@ -93,9 +97,9 @@ def test_what_computes_nothing_does_not_wait_for_jax(command):
 
 
 def test_python_m_linkax_is_the_command():
-    environment = os.environ | {"PYTHONPATH": str(Path(linkax_command.__file__).parents[1])}
-    asked = [sys.executable, "-m", "linkax", "--version"]
-    assert "linkax 0.1.0" in subprocess.run(asked, capture_output=True, text=True, env=environment, check=True).stdout
+    found = asked("-m", "linkax", "--version")
+    assert found.returncode == 0
+    assert "linkax 0.1.0" in found.stdout
 
 
 def test_the_parser_names_what_there_is():
@@ -145,15 +149,8 @@ def test_summary_for_people(capsys, tmp_path):
     (tmp_path / "trajectory-interrupted.npz").write_text("of an earlier run")
     assert run(command) == 0
     printed = capsys.readouterr().out
-    for word in (
-        "successful",
-        "steps",
-        "compile time",
-        "run time",
-        "position violation",
-        "energy unaccounted for",
-        "bob",
-    ):
+    words = "successful", "steps", "compile time", "run time", "position violation", "energy unaccounted for", "bob"
+    for word in words:
         assert word in printed
     assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "trajectory.npz"}
 

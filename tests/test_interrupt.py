@@ -106,10 +106,8 @@ def test_twice_ends_at_once(tmp_path):
 @pytest.mark.parametrize("code", [0, 1, 2])
 def test_a_command_that_ends_by_itself_has_its_own_code(code, tmp_path):
     path = stands_in(tmp_path, f"def run(*_):\n    return {code}")
-    assert (
-        subprocess.run([*COMMAND, *SIMULATE], env=os.environ | {"PYTHONPATH": str(path)}, check=False).returncode
-        == code
-    )
+    environment = os.environ | {"PYTHONPATH": str(path)}
+    assert subprocess.run([*COMMAND, *SIMULATE], env=environment, check=False).returncode == code
 
 
 def test_files_that_were_being_written_are_removed(tmp_path):

@@ -64,7 +64,8 @@ READINGS = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param("reactions", marks=pytest.mark.slow), "states"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READINGS)
 def test_readings(large, name):
     assert not batched_calls(READINGS[name], times(*large, 41))
 
@@ -75,10 +76,10 @@ MEMBERS = {
     "simulate": lambda mechanism, state: lx.simulate(mechanism, state, t1=1.0),
     "identity metric": lambda mechanism, state: lx.simulate(mechanism, state, t1=1.0, formulation=IDENTITY),
 }
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("simulate", "identity metric")]
 
 
-@pytest.mark.parametrize("name", ["assemble", *SLOW])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MEMBERS)
 def test_batches(large, name):
     assert not batched_calls(*in_a_batch(MEMBERS[name], *large))
 

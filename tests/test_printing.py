@@ -13,17 +13,6 @@ import linkax as lx
 from linkax.tables import MOST_ROWS, SMALL, Rows, Table, numbers
 
 
-def at_zero(mechanism):
-    """A state that tells the joints' names, on no closed loops."""
-    topology = mechanism.topology
-    return lx.State(jnp.zeros(topology.num_coordinates), jnp.zeros(topology.num_speeds), topology)
-
-
-def states(mechanism, state):
-    """States of a batch of three."""
-    return lx.State(jnp.stack([state.q] * 3), jnp.arange(3.0)[:, None] * jnp.ones_like(state.v), mechanism.topology)
-
-
 def test_a_state_names_joints_with_units():
     mechanism = mechanism_of("crank-slider")
     state = lx.State(np.array([0.25, 0.4, -0.3]), np.array([2.0, -0.1, -2.5]), mechanism.topology)
@@ -33,7 +22,7 @@ def test_a_state_names_joints_with_units():
     assert {row.split()[0] for row in rows} == set(mechanism.topology.coordinates)
     assert " m " in repr(state)
     assert "<th" in state._repr_html_()
-    text = repr(states(mechanism, state))
+    text = repr(lx.State(jnp.stack([state.q] * 3), jnp.arange(3.0)[:, None] * jnp.ones(3), mechanism.topology))
     assert "a batch of 3" in text
     assert "0 to 2 rad/s" in text
     assert "bearing" in repr(lx.Solution.of_state(mechanism, lx.State(state.q, state.v)).end)
@@ -50,7 +39,7 @@ def test_a_drive_tells_speed_and_start_with_units():
 
 def test_what_is_traced_or_missing_shows_shapes():
     mechanism = mechanism_of("planar-four-bar")
-    state, seen = at_zero(mechanism), []
+    state, seen = lx.State.as_drawn(mechanism), []
 
     def shown(mechanism, state):
         seen.extend(map(repr, (mechanism, state, lx.Reaction(state.q, state.q))))
@@ -105,7 +94,7 @@ COUNTS = {
 def test_mobility_counts_as_textbooks_do(scene, variant):
     mechanism = mechanism_of(scene, variant)
     # Of the structure alone; ranks are those that tests/analysis find.
-    found = eqx.filter_eval_shape(lx.mobility, mechanism, at_zero(mechanism))
+    found = eqx.filter_eval_shape(lx.mobility, mechanism, lx.State.as_drawn(mechanism))
     equations, spatial, planar, freedoms, redundant = COUNTS[scene, variant]
     assert sum(found.joint_equations.values()) == equations
     assert found.spatial_count == spatial == 6 * mechanism.topology.num_bodies - equations
@@ -144,7 +133,7 @@ def test_mobility_of_a_bennett_loop():
 
 def test_a_run_tells_how_it_went():
     mechanism = mechanism_of("pendulum")
-    solution = lx.simulate(mechanism, at_zero(mechanism), t1=0.1)
+    solution = lx.simulate(mechanism, lx.State.as_drawn(mechanism), t1=0.1)
     with compilations() as compiled:
         text = repr(solution)
         assert "<table>" in solution._repr_html_()

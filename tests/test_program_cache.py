@@ -88,6 +88,7 @@ def first(tmp_path_factory):
     return folder, ran(folder)[0]
 
 
+@pytest.mark.users_settings
 def test_a_second_process_traces_and_compiles_nothing(first):
     """With functions of a user, which may hash otherwise there."""
     path, (force, programs, asked, found, folder) = first
@@ -195,36 +196,18 @@ class Lengths(np.ndarray):
 made: dict = {"__name__": "linkax"}
 exec("class Made:\n    pass\n\ndef doubled(t):\n    return 2.0 * t", made)
 doubled, partly = made["doubled"], functools.partial(jnp.dot, Mine())
+THINGS = [
+    Mine(), Mine, Count.one, Length(1.0), np.ones(2).view(Lengths), made["Made"], made["Made"](),
+    functools.partial(lambda: 1), object(), compilations,
+]  # fmt: skip
+LAWS = [
+    lambda t: Mine(t).number, lambda t: Count.one * t, lambda t: doubled(t), lambda t: partly(t),
+    lambda t: jnp.interp(t, *np.loadtxt("profile.csv")), lambda t: t * float(os.environ.get("RATE", "1")),
+    lambda t: t * np.random.normal(), lambda t: t * len(pytest.__name__),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "own",
-    [
-        Mine(),
-        Mine,
-        Count.one,
-        Length(1.0),
-        np.ones(2).view(Lengths),
-        made["Made"],
-        made["Made"](),
-        functools.partial(lambda: 1),
-        object(),
-        compilations,
-        *map(
-            Function,
-            [
-                lambda t: Mine(t).number,
-                lambda t: Count.one * t,
-                lambda t: doubled(t),
-                lambda t: partly(t),
-                lambda t: jnp.interp(t, *np.loadtxt("profile.csv")),
-                lambda t: t * float(os.environ.get("RATE", "1")),
-                lambda t: t * np.random.normal(),
-                lambda t: t * len(pytest.__name__),
-            ],
-        ),
-    ],
-)
+@pytest.mark.parametrize("own", [*THINGS, *map(Function, LAWS)])
 def test_what_may_change_is_not_described(own):
     """A name may stay where what it means changes, and so may what is outside of a program."""
     with pytest.raises(Undescribed):

@@ -21,25 +21,11 @@ BY_HAND = {page: re.findall(r"\.\. py:data:: linkax\.(\w+)", text) for page, tex
 DESCRIBED = {page: [*LISTS[page].split(), *BY_HAND[page]] for page in TEXTS}
 
 # Minutes of compiling.
-SLOW = tuple(
-    f"reference/{page}"
-    for page in (
-        "assembly",
-        "solution",
-        "derivatives",
-        "kinematics",
-        "synthesis",
-        "laboratory",
-        "tolerances",
-        "formulations",
-        "beams",
-        "internal_states",
-        "files",
-        "constraints",
-        "joints",
-    )
-)
-mark = lambda name: pytest.mark.slow if name in SLOW else pytest.mark.users_settings
+SLOW = (
+    "assembly", "solution", "derivatives", "kinematics", "synthesis", "laboratory", "tolerances", "formulations",
+    "beams", "internal_states", "files", "constraints", "joints",
+)  # fmt: skip
+mark = lambda name: pytest.mark.slow if name.removeprefix("reference/") in SLOW else pytest.mark.users_settings
 
 
 def test_every_public_name_is_on_one_page():

@@ -98,6 +98,7 @@ def test_notebooks_are_let_pass(tmp_path):
     assert {name: errors for name, errors in errors_of(notebooks, tmp_path).items() if errors} == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", range(len(WRONG)), ids=list(WRONG))
 def test_wrong_programs_are_told(told, line):
     messages = [message for at, message in told["wrong"] if at == BEGIN.count("\n") + line]

@@ -25,7 +25,6 @@ from linkax.view.page import MOST_NUMBERS
 
 # A browser without a graphics card computes its pictures on the processor.
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-CORNERS = {"platform": ("platform", None)}
 
 
 @pytest.fixture(scope="module")
@@ -344,7 +343,7 @@ def test_the_reaction_of_a_drive_is_its_torque_or_force():
         lx.plot.reaction(here, "engine")
 
 
-@pytest.mark.parametrize("name", ["bricard", "stewart"])
+@pytest.mark.parametrize("name", ["bricard", pytest.param("stewart", marks=pytest.mark.slow)])
 def test_spatial_mechanisms_are_seen_from_a_corner(name):
     """No rod points at the eye."""
     mechanism, state, points = (*stewart_platform(), {}) if name == "stewart" else scene(name)

@@ -79,24 +79,6 @@ def test_frequency_on_the_tangent_space_of_a_redundant_loop():
 
 
 @pytest.mark.slow
-def test_derivative_of_an_equilibrium_and_of_a_frequency():
-    def stretched(stiffness):
-        body = lx.point_mass("body", 2.0)
-        slide = lx.Prismatic("slide", lx.GROUND, body, "y")
-        forces = [lx.Gravity([0.0, -9.81, 0.0]), lx.JointSpring("slide", stiffness, 0.5)]
-        mechanism = lx.Mechanism([body], [slide], forces)
-        rest = lx.equilibrium(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)))
-        return rest.q[0], lx.linearise(mechanism, rest, degrees_of_freedom=1).natural_frequencies[0]
-
-    place, frequency = stretched(30.0)
-    np.testing.assert_allclose(place, 0.5 - 2.0 * 9.81 / 30.0, rtol=1e-12)
-    np.testing.assert_allclose(frequency, np.sqrt(15.0), rtol=1e-12)
-    found = jax.jacfwd(stretched)(30.0)
-    np.testing.assert_allclose(found, [2.0 * 9.81 / 30.0**2, 0.5 / np.sqrt(15.0) / 2.0], rtol=1e-9)
-    np.testing.assert_allclose(jax.grad(lambda k: stretched(k)[0])(30.0), found[0], rtol=1e-9)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_derivatives_of_modes_and_frequencies(order):
     """And they: of two bodies on one guide, the first between wall and spring, the second behind the spring."""

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import pendulum
 
 import linkax as lx
 
@@ -33,26 +34,19 @@ def test_its_derivative():
     np.testing.assert_allclose(slope, np.sqrt(STIFFNESS / MASS) / (2.0 * MODULUS), rtol=1e-7)
 
 
-ROD = lx.rod("rod", 1.0, mass=3.0)
-PIN = lx.Revolute("pin", lx.GROUND, ROD, "z")
-WEIGHT = 3.0 * 9.81 * 0.5
-
-
-def pendulum(*forces):
-    return lx.Mechanism([ROD], [PIN], [lx.Gravity([0.0, -9.81, 0.0]), *forces])
+WEIGHT = 3.0 * 9.81 * 0.5  # of a pendulum of 3 kg and 1 m, as a torque
 
 
 def held(voltage, current=2.0):
-    return pendulum(
-        lx.DCMotor("pin", voltage, resistance=2.0, inductance=0.1, constant=1.5, current=current, name="motor")
-    )
+    numbers = {"resistance": 2.0, "inductance": 0.1, "constant": 1.5, "current": current}
+    return pendulum(mass=3.0, forces=[lx.DCMotor("hinge", voltage, **numbers, name="motor")])
 
 
 def test_a_motor_that_holds_a_pendulum():
     """Its current, and the angle at which weight and torque balance, at rest; the eigenvalues of a matrix by hand."""
     angle, inertia = -np.arccos(3.0 / WEIGHT), 1.0
     mechanism = held(4.0)
-    state = lx.assemble(mechanism, {"pin": angle})
+    state = lx.assemble(mechanism, {"hinge": angle})
     small = lx.linearise(mechanism, state)
     stiffness = -WEIGHT * np.sin(angle) / inertia
     by_hand = np.array([[0.0, 1.0, 0.0], [-stiffness, 0.0, 1.5 / inertia], [0.0, -15.0, -20.0]])
@@ -66,7 +60,7 @@ def test_a_motor_that_holds_a_pendulum():
 
 def resting(voltage):
     mechanism = held(voltage, current=0.0)
-    state = lx.equilibrium(mechanism, lx.assemble(mechanism, {"pin": -1.0}))
+    state = lx.equilibrium(mechanism, lx.assemble(mechanism, {"hinge": -1.0}))
     return jnp.stack([state.q[0], state.internal[0]])
 
 
@@ -84,9 +78,9 @@ def test_its_derivatives(mode):
 
 @pytest.mark.slow
 def test_an_integrator_holds_its_target_in_equilibrium():
-    controller = lx.PIDController("pin", 0.5, proportional=60.0, integral=30.0, derivative=10.0, name="controller")
-    mechanism = pendulum(controller)
-    state = lx.equilibrium(mechanism, lx.assemble(mechanism, {"pin": 0.0}))
+    controller = lx.PIDController("hinge", 0.5, proportional=60.0, integral=30.0, derivative=10.0, name="controller")
+    mechanism = pendulum(mass=3.0, forces=[controller])
+    state = lx.equilibrium(mechanism, lx.assemble(mechanism, {"hinge": 0.0}))
     np.testing.assert_allclose(state.q, 0.5, rtol=1e-10)
     np.testing.assert_allclose(state.internal, [WEIGHT * np.cos(0.5) / 30.0, 0.0], atol=1e-9)
     assert np.max(lx.linearise(mechanism, state).eigenvalues.real) < 0.0
@@ -108,6 +102,6 @@ class Counter(lx.AbstractForce):
 
 @pytest.mark.slow
 def test_what_never_stands_still_has_no_equilibrium():
-    mechanism = pendulum(Counter())
+    mechanism = pendulum(forces=[Counter()])
     with pytest.raises(lx.EquilibriumError, match="no equilibrium near this state"):
-        lx.equilibrium(mechanism, lx.assemble(mechanism, {"pin": -1.5}))
+        lx.equilibrium(mechanism, lx.assemble(mechanism, {"hinge": -1.5}))

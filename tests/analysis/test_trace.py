@@ -123,9 +123,8 @@ def test_arc_length_through_turning_points(linkage):
 def test_derivatives_by_arc_length(linkage):
     def loss(lengths):
         mechanism = four_bar(lengths)
-        found = lx.trace(
-            mechanism, lx.assemble(mechanism, {"A": 0.1}, {"A": 1.0}, guess=UP), arc_length=np.linspace(0.1, 1.0, 10)
-        )
+        start = lx.assemble(mechanism, {"A": 0.1}, {"A": 1.0}, guess=UP)
+        found = lx.trace(mechanism, start, arc_length=np.linspace(0.1, 1.0, 10))
         return jnp.sum(found.q**2) + jnp.sum(found.v_rate)
 
     lengths, value = jnp.asarray(LENGTHS), jax.jit(loss)
@@ -267,21 +266,15 @@ def test_bad_input(linkage, given, told):
 
 
 def test_what_is_no_ratio_of_forces(linkage):
-    mechanism, start = linkage
-    found = lx.trace(mechanism, start, arc_length=[0.1])
+    found = lx.trace(*linkage, arc_length=[0.1])
     with pytest.raises(ValueError, match="the trace is along the arc length"):
         found.mechanical_advantage("D")
 
 
-def test_single_precision_is_refused(linkage):
+def test_starts_that_are_refused(linkage):
     mechanism, start = linkage
-    single = lx.State(start.q.astype(np.float32), start.v.astype(np.float32))
     with pytest.raises(ValueError, match="start is in float32"):
-        lx.trace(mechanism, single, {"A": [0.1]})
-
-
-def test_arc_length_needs_a_direction(linkage):
-    mechanism, start = linkage
+        lx.trace(mechanism, lx.State(start.q.astype(np.float32), start.v.astype(np.float32)), {"A": [0.1]})
     with pytest.raises(ValueError, match="start has no speeds"):
         lx.trace(mechanism, lx.State(start.q, 0.0 * start.v), arc_length=[0.1])
 

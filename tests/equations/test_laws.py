@@ -28,6 +28,7 @@ from linkax.model.beams import BeamElasticity
 from linkax.spatial.vectors import cross
 
 SIDES = ("child", "parent")
+STORING = (lx.Gravity, lx.Spring, lx.JointSpring, lx.ElasticRope, BeamElasticity)
 DRAWS = settings(max_examples=4, deadline=None, derandomize=True, database=None)
 
 
@@ -144,11 +145,7 @@ def laws(mechanism, t, q, v, acceleration, multipliers):
     solved = jnp.linalg.solve(mass, force + jacobian.T @ multipliers)
     energy = along(lambda t, q, v: kinetic_energy(system, t, q, v), solved)
     stored = along(lambda t, q, v: dynamics.potential_energy(configure(system, t, q)), solved)
-    storing = [
-        force
-        for force in system.forces
-        if isinstance(force, (lx.Gravity, lx.Spring, lx.JointSpring, lx.ElasticRope, BeamElasticity))
-    ]
+    storing = [force for force in system.forces if isinstance(force, STORING)]
     loads = reduce(lx.Load.plus, [force.applied(t, motion) for force in storing], lx.Load.none(system))
     released = loads.joint_force + dynamics.along_speeds(configuration, loads.force, loads.moment)
     momenta = jnp.concatenate(along(lambda t, q, v: momentum(system, t, q, v), solved))

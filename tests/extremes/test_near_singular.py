@@ -71,12 +71,6 @@ def test_motion_too_small_for_its_branch_is_told(distance):
         lx.simulate(mechanism, state, t1=2.0 * DURATION, accuracy=lx.Accuracy(rtol=1e-13))
 
 
-def test_standing_still_in_a_singular_configuration_is_no_motion():
-    mechanism, state = turning(equal_lengths(np.pi / 2, 0.0, 0.0))
-    found = lx.simulate(mechanism, state, t1=DURATION)
-    np.testing.assert_allclose(found.joint("bearing"), np.pi / 2, atol=1e-14)
-
-
 def test_passages_in_single_precision_are_told():
     settings = equal_lengths(0.3, 8.0, 0.0)
     with pytest.warns(lx.AccuracyWarning, match="single precision"):

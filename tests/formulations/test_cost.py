@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from known_answers import mechanism_of
+from mechanisms import crank_slider, four_bar
 
 import linkax as lx
 from linkax.equations import constraint_rows, coordinates, joint_motions, loops
@@ -20,16 +22,11 @@ class PinInPlane(lx.Revolute):
     locked_translations = (1, 2)
 
 
-def four_bar(closing):
-    bars = [lx.rod(name, 1.0, 1.0) for name in ("crank", "coupler", "rocker")]
-    crank, coupler, rocker = bars
-    joints = [
-        lx.Revolute("A", lx.GROUND, crank.at("base"), "z"),
-        lx.Revolute("B", crank.at("tip"), coupler.at("base"), "z"),
-        closing("C", coupler.at("tip"), rocker.at("tip"), "z", cut=True),
-        lx.Revolute("D", lx.GROUND.at([1.2, 0.0, 0.0]), rocker.at("base"), "z"),
-    ]
-    return lx.Mechanism(bars, joints, [lx.Gravity([0.0, -9.81, 0.0])])
+def closed_by(kind):
+    """A four-bar with a joint of this kind in place of the pin that closes it."""
+    drawn = four_bar(1.0, 1.0, 1.0, 1.2, cut="rocker_pin")
+    again = lambda pin: kind(pin.name, pin.parent, pin.child, "z", cut=True)
+    return lx.Mechanism(drawn.bodies, [again(joint) if joint.cut else joint for joint in drawn.joints], drawn.forces)
 
 
 def compiled(mechanism):
@@ -46,13 +43,13 @@ def compiled(mechanism):
 
 
 def test_spatial_joints_in_a_plane_cost_what_rows_picked_by_hand_cost():
-    (spatial, operations), (planar, by_hand) = compiled(four_bar(lx.Revolute)), compiled(four_bar(PinInPlane))
+    (spatial, operations), (planar, by_hand) = compiled(closed_by(lx.Revolute)), compiled(closed_by(PinInPlane))
     np.testing.assert_allclose(spatial, planar, rtol=1e-12)
     assert operations <= 1.3 * by_hand
     # With every row the program is longer: the count sees what it is meant to see.
     any_axis = lambda *arguments, **options: lx.Revolute(*arguments[:-1], jnp.array([0.0, 0.0, 1.0]), **options)
-    assert four_bar(any_axis).topology.num_rows == 5
-    assert compiled(four_bar(any_axis))[1] > by_hand
+    assert closed_by(any_axis).topology.num_rows == 5
+    assert compiled(closed_by(any_axis))[1] > by_hand
 
 
 def traced(mechanism):
@@ -77,7 +74,7 @@ def test_special_elements_are_traced_where_they_are(monkeypatch):
     for module, name in (*special, (joint_motions, "_bent"), (ropes, "_spans")):
         monkeypatch.setattr(module, name, refuse)
     bar, hinge = lx.rod("bar", 1.0, 1.0), lx.Revolute("hinge", lx.GROUND, lx.rod("bar", 1.0, 1.0), "z")
-    traced(four_bar(lx.Revolute))
+    traced(closed_by(lx.Revolute))
     beam = lx.Beam("beam", 1.0, lx.Section(1.0, 1.0), elements=1, bends="z", torsion=False, stretch=False)
     for joints, constraints in (
         ([hinge, lx.Fixed("weld", bar, beam)], []),
@@ -93,18 +90,9 @@ def test_special_elements_are_traced_where_they_are(monkeypatch):
 
 
 def test_mechanisms_that_share_only_ground_are_islands():
-    def slider_crank(number):
-        crank, rod = lx.rod(f"crank{number}", 1.0, 1.0), lx.rod(f"rod{number}", 1.3, 1.0)
-        slider = lx.point_mass(f"slider{number}", 1.0)
-        return [crank, rod, slider], [
-            lx.Revolute(f"bearing{number}", lx.GROUND, crank.at("base"), "z"),
-            lx.Revolute(f"crank_pin{number}", crank.at("tip"), rod.at("base"), "z"),
-            lx.Revolute(f"wrist_pin{number}", rod.at("tip"), slider, "z"),
-            lx.Prismatic(f"guide{number}", lx.GROUND, slider, "x"),
-        ]
-
-    (bodies, joints), (more_bodies, more_joints) = slider_crank(0), slider_crank(1)
+    slider, bars = crank_slider(), mechanism_of("n-four-bar", changes={"N": 1})
+    bodies, joints = [*slider.bodies, *bars.bodies], [*slider.joints, *bars.joints]
     sizes = lambda mechanism: [(len(rows), len(columns)) for rows, columns in structure_of(mechanism.topology).islands]
-    gears = lx.Coupling("gears", {"bearing0": 1.0, "bearing1": 1.0})
-    assert sizes(lx.Mechanism(bodies + more_bodies, joints + more_joints)) == [(2, 3), (2, 3)]
-    assert sizes(lx.Mechanism(bodies + more_bodies, joints + more_joints, constraints=[gears])) == [(5, 6)]
+    gears = lx.Coupling("gears", {"bearing": 1.0, "pivot_0": 1.0})
+    assert sizes(lx.Mechanism(bodies, joints)) == [(2, 3), (2, 3)]
+    assert sizes(lx.Mechanism(bodies, joints, constraints=[gears])) == [(5, 6)]

@@ -94,17 +94,11 @@ def of_linkax(method, system, q, v):
     """c, J, M, b, f, γ at a state off the loops or on them, and every step there."""
     linear = linear_system(system, 0.0, q)
     factors, motion = method.split(linear), move(linear.configuration, v)
+    c, b = residual(linear.configuration), rate(linear.configuration)
     f, right = generalised_force(motion), gamma(motion)
     acceleration, multipliers = method.solve_accelerations(linear, factors, f, right, refinements=2)
     return {
-        "equations": (
-            residual(linear.configuration),
-            linear.jacobian,
-            linear.mass,
-            rate(linear.configuration),
-            f,
-            right,
-        ),
+        "equations": (c, linear.jacobian, linear.mass, b, f, right),
         "distance": factors.distance,
         "position": method.correct_position(linear, factors, linear.configuration),
         "velocity": method.correct_velocity(linear, factors, v, refinements=2),

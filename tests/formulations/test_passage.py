@@ -1,5 +1,7 @@
 """Values close to a singular configuration, as limits."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,34 +12,25 @@ from linkax.formulations.singular_limit import NEAR, Direction, Value, singular_
 UNITS = jnp.ones(2)
 
 
-def value(noise, kink, gap, q):
+def spoiled(noise, t, q, kink=0.0, gap=0.0):
     """A smooth function of q, and what a singular configuration at q[0] = 0 does to it."""
-    spoiled = jnp.where(jnp.abs(q[0]) < 0.5 * NEAR, noise, 0.0)
+    added = jnp.where(jnp.abs(q[0]) < 0.5 * NEAR, noise, 0.0)
     smooth = jnp.stack([jnp.sin(q[0]) + q[1], jnp.cos(2.0 * q[0])])
-    return Value((q, smooth + spoiled + kink * jnp.abs(q[0])), jnp.abs(q[0]), jnp.asarray(gap))
+    return Value((q, smooth + added + kink * jnp.abs(q[0])), jnp.abs(q[0]), jnp.asarray(gap))
 
 
-def spoiled(arguments, t, q):
-    return value(arguments, 0.0, 0.0, q)
+kinked, open_between = partial(spoiled, kink=1.0), partial(spoiled, gap=1e-9)
 
 
-def kinked(arguments, t, q):
-    return value(arguments, 1.0, 0.0, q)
-
-
-def open_between(arguments, t, q):
-    return value(arguments, 0.0, 1e-9, q)
-
-
-def unbounded(arguments, t, q):
+def unbounded(noise, t, q):
     """Odd: it cancels in the mean of both sides."""
-    found = value(arguments, 0.0, 0.0, q)
+    found = spoiled(noise, t, q)
     return found._replace(answers=(q, found.answers[1] + 1.0 / q[0]))
 
 
-def no_number(arguments, t, q):
+def no_number(noise, t, q):
     """At the state itself and at the interpolated one."""
-    found = value(arguments, 0.0, 0.0, q)
+    found = spoiled(noise, t, q)
     return found._replace(answers=(q, jnp.where(jnp.abs(q[0]) < 0.5 * NEAR, jnp.nan, found.answers[1])))
 
 

@@ -168,8 +168,7 @@ def test_masses_that_only_the_loops_hold_are_no_hindrance():
 def test_a_cell_that_becomes_singular(away):
     """Rows of one front made dependent, or nearly so: ranks and answers follow."""
     given = system("four-bars")
-    first, second = (np.array(given.plan.rows[4]) for _ in range(2))
-    first, second = first[0], second[1]
+    first, second = given.plan.rows[4][:2]
     jacobian = given.jacobian.copy()
     jacobian[second] = jacobian[first] + away * jacobian[second]
     given = given._replace(jacobian=jacobian, rate=jacobian @ np.ones(len(given.mass)))

@@ -3,12 +3,10 @@
 import sys
 from pathlib import Path
 
-import equinox as eqx
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from beside_mujoco import matrix_of_speeds, positions, tree_dynamics
+from beside_mujoco import check_loops, matrix_of_speeds, positions, state_of, tree_dynamics
 
 import linkax as lx
 
@@ -77,13 +75,6 @@ def with_states(text, path, count, seed):
     keys = "".join(f'<key qpos="{words(qpos)}" qvel="{words(qvel)}"/>' for qpos, qvel in states)
     path.write_text(text.replace("</mujoco>", f"<keyframe>{keys}</keyframe></mujoco>"))
     return model, states
-
-
-def state_of(mechanism, start):
-    """The state at a start, of joints in the tree alone."""
-    order = mechanism.topology.coordinates
-    flat = lambda given: np.concatenate([np.atleast_1d(given[name]) for name in order if name in given])
-    return lx.State(jnp.asarray(flat(start.positions)), jnp.asarray(flat(start.speeds)), mechanism.topology)
 
 
 def of_package(name, *disabled):
@@ -237,11 +228,7 @@ def test_other_spatial_tendons_are_not_dropped_in_silence(tmp_path, numbers, mor
 @pytest.mark.parametrize(("name", "freedoms"), [("robotiq_2f85_v2", 3), ("xarm7_gripper", 1)])
 def test_grippers_close_their_loops(name, freedoms):
     mechanism = lx.load(MACHINES / f"{name}.xml").mechanism()
-    state = lx.assemble(mechanism, {"right_driver_joint": 0.3})
-    found = lx.mobility(mechanism, state)
-    assert (mechanism.topology.num_cuts, found.degrees_of_freedom, found.num_redundant) == (2, freedoms, 2)
-    open_by = eqx.filter_jit(lambda state: lx.Solution.of_state(mechanism, state).worst_violation().position)
-    assert open_by(state) < 1e-12
+    check_loops(mechanism, (2, freedoms, 2), lx.assemble(mechanism, {"right_driver_joint": 0.3}))
 
 
 @pytest.mark.filterwarnings("ignore::linkax.LeftOutWarning")

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 import pytest
+from beside_mujoco import check_loops
 
 import linkax as lx
 
@@ -19,25 +19,17 @@ def cassie(name, **settings):
         return lx.load(MACHINES / f"{name}.sdf", **({"ignore": ["contact", "limit"]} | settings))
 
 
-def check_loops(mechanism, *expected):
-    state = lx.assemble(mechanism)
-    found = lx.mobility(mechanism, state)
-    assert (mechanism.topology.num_cuts, found.degrees_of_freedom, found.num_redundant) == expected
-    open_by = eqx.filter_jit(lambda state: lx.Solution.of_state(mechanism, state).worst_violation().position)
-    assert open_by(state) < 1e-12
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASSIE)
 def test_cassie_closes_its_loops(name):
-    check_loops(cassie(name).mechanism(), *CASSIE[name])
+    check_loops(cassie(name).mechanism(), CASSIE[name])
 
 
 @pytest.mark.slow
 def test_a_leg_of_cassie_closes_its_loops():
     both = cassie("cassie_v2").mechanism()
     left = lambda parts: [part for part in parts if not part.name.startswith("right")]
-    check_loops(lx.Mechanism(left(both.bodies), left(both.joints)), 2, 12, 1)
+    check_loops(lx.Mechanism(left(both.bodies), left(both.joints)), (2, 12, 1))
 
 
 def test_whole_angles_make_planar_loops_of_those_that_are_meant_so():

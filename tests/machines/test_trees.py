@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 import pytest
-from beside_mujoco import matrix_of_speeds, positions, tree_dynamics
+from beside_mujoco import matrix_of_speeds, positions, random_state, tree_dynamics
 from scipy.spatial.transform import Rotation
 
 import linkax as lx
@@ -100,13 +100,11 @@ def worst_difference(mechanism, model):
     shared = [name for name in topology.bodies if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0]
     data, full, found = mujoco.MjData(model), np.zeros((model.nv, model.nv)), []
     for _ in range(STATES):
-        q, v = rng.normal(size=topology.num_coordinates), rng.normal(size=topology.num_speeds)
-        for place, _ in topology.quaternions:
-            q[place : place + 4] /= np.linalg.norm(q[place : place + 4])
-        mass, force, centers = map(np.array, tree_dynamics(mechanism, lx.State(q, v, topology)))
-        data.qpos = positions(model, mechanism, names, q)
+        state = random_state(mechanism, rng)
+        mass, force, centers = map(np.array, tree_dynamics(mechanism, state))
+        data.qpos = positions(model, mechanism, names, state.q)
         into = matrix_of_speeds(model, mechanism, names, data.qpos)
-        data.qvel = np.linalg.solve(into, v)
+        data.qvel = np.linalg.solve(into, state.v)
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, full)
         for own, theirs in (

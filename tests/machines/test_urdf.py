@@ -43,12 +43,8 @@ def load(tmp_path, closed="", more="", **settings):
 def drawn_apart(machine, name):
     """How far the two ends of a joint are apart as drawn, from the offsets alone: nothing is turned."""
     ends = next(joint for joint in machine.joints if joint.name == name).arguments
-    at = {
-        "coupler": [0.0, 0.0, 1.0],
-        "rocker": [2.0, 0.0, 0.0],
-        "coupler_end": [2.0, 0.0, 1.0],
-        "rocker_end": [2.0, 0.0, 1.0],
-    }
+    at = {"coupler": [0.0, 0.0, 1.0], "rocker": [2.0, 0.0, 0.0]}
+    at |= {end: [2.0, 0.0, 1.0] for end in ("coupler_end", "rocker_end")}
     return np.abs(ends["parent"].offset + at[ends["parent"].body] - ends["child"].offset - at[ends["child"].body]).max()
 
 

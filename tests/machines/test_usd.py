@@ -5,16 +5,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 import pytest
+from beside_mujoco import check_loops, tree_dynamics
 
 import linkax as lx
-from linkax.equations.configuration import configure
-from linkax.equations.dynamics import generalised_force, mass_matrix
-from linkax.equations.motion import move
-from linkax.equations.system import system_of
 
 MODULES: list[Any] = [
     importlib.import_module(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom", "UsdPhysics", "UsdUtils")
@@ -45,23 +40,14 @@ def by_hand():
     return lx.Mechanism(bars, joints, [lx.Gravity((0.0, 0.0, -float(np.float32(9.8067))))])
 
 
-@jax.jit
-def tree_dynamics(mechanism, state):
-    configuration = configure(system_of(mechanism, np.float64), 0.0, state.q)
-    motion = move(configuration, state.v)
-    return mass_matrix(configuration), generalised_force(motion), configuration.world_center_of_mass()
-
-
+@pytest.mark.slow
 def test_a_floating_four_bar_is_what_it_is_by_hand():
     machine = lx.load(FOUR_BAR, ignore=["contact", "limit"])
     assert {body.where.line for body in machine.bodies} == {21, 55, 89, 123}
     read, made = machine.mechanism(), by_hand()
     speeds = {"body_1.free": [0.1, 0.3, -0.2, 0.2, 0.5, 0.4], "joint_1": 1.3}
     state = lx.assemble(read, {"joint_1": 0.3}, speeds)
-    found = lx.mobility(read, state)
-    assert (read.topology.num_cuts, found.degrees_of_freedom, found.num_redundant) == (1, 7, 3)
-    open_by = eqx.filter_jit(lambda state: lx.Solution.of_state(read, state).worst_violation().position)
-    assert open_by(state) < 1e-12
+    check_loops(read, (1, 7, 3), state)
     assert read.topology.coordinates == made.topology.coordinates
     for first, second in zip(*(tree_dynamics(each, state) for each in (read, made)), strict=True):
         assert np.abs(np.asarray(first) - np.asarray(second)).max() < 1e-12

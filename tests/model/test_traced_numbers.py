@@ -28,10 +28,13 @@ NOT_NEGATIVE = [*NONE, -1.0]
 VECTOR = (np.ones(3), [[1.0, np.nan, 0.0], [np.inf, 0.0, 0.0]])
 AXIS = (np.array([1.0, 0.0, 0.0]), [*VECTOR[1], np.zeros(3), [1e200, 1e200, 0.0]])
 ROTATION = (np.eye(3), [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3)), np.full((3, 3), np.nan)])
+RANGE = (np.array([-1.0, 1.0]), [[1.0, -1.0], [0.0, 0.0], [np.nan, 1.0], [0.0, np.inf]])
 INERTIA = (
     np.eye(3),
     [np.diag([1.0, 1.0, -0.5]), np.diag([1.0, 1.0, 2.5]), np.eye(3) + np.eye(3, k=1), np.full((3, 3), np.inf)],
 )
+HYDRAULIC = {"areas": (1.0, 1.0), "stroke": 1.0, "valve": 1.0, "supply": 1e7, "dead_volume": 1.0}
+LAW = lx.ContactLaw(1.0)
 ALONG_AN_AXIS = lx.Revolute, lx.Prismatic, lx.Cylindrical, lx.Planar, lx.Rectangular, lx.Universal, lx.ConstantVelocity
 # For each element a number of it that is traced, a value that it can have, and those that it cannot have.
 CASES = {
@@ -39,8 +42,7 @@ CASES = {
     "body: centre of mass": (lambda x: lx.RigidBody("body", 1.0, x), *VECTOR),
     "body: inertia": (lambda x: lx.RigidBody("body", 1.0, inertia=x), *INERTIA),
     "body: principal moments": (
-        lambda x: lx.RigidBody("body", 1.0, inertia=x),
-        np.ones(3),
+        lambda x: lx.RigidBody("body", 1.0, inertia=x), np.ones(3),
         [[1.0, 1.0, -0.5], [1.0, 2.5, 1.0], [1.0, np.nan, 1.0]],
     ),
     "body: frame": (lambda x: lx.RigidBody("body", 1.0, frames={"tip": x}), *VECTOR),
@@ -66,9 +68,7 @@ CASES = {
         for kind in (lx.Spherical, lx.Fixed, lx.Free)
     },
     "second axis": (
-        lambda x: lx.Universal("joint", **ENDS, axis="x", second_axis=x),
-        np.array([0.0, 1.0, 0.0]),
-        [*AXIS[1], [1.0, 1.0, 0.0]],
+        lambda x: lx.Universal("joint", **ENDS, axis="z", second_axis=x), AXIS[0], [*AXIS[1], [1.0, 0.0, 1.0]],
     ),
     "axis next to a second one": (
         lambda x: lx.Universal("joint", **ENDS, axis=x, second_axis="y"), AXIS[0], [[1.0, 1.0, 0.0]],
@@ -110,23 +110,15 @@ CASES = {
     "AffineActuator: factor": (lambda x: lx.AffineActuator({"pin": x}), -1.0, [*NONE, 0.0]),
     "AffineActuator: bias": (lambda x: lx.AffineActuator("pin", bias=x), *VECTOR),
     "AffineActuator: gain": (lambda x: lx.AffineActuator("pin", gain=x), *VECTOR),
-    "AffineActuator: force range": (
-        lambda x: lx.AffineActuator("pin", force_range=x), np.array([-1.0, 1.0]),
-        [[1.0, -1.0], [0.0, 0.0], [np.nan, 1.0], [0.0, np.inf]],
-    ),
+    "AffineActuator: force range": (lambda x: lx.AffineActuator("pin", force_range=x), *RANGE),
     "DCMotor: inductance": (
         lambda x: lx.DCMotor("pin", 1.0, resistance=1.0, inductance=x, constant=1.0), 1.0, POSITIVE,
     ),
     "HydraulicCylinder: bulk modulus": (
-        lambda x: lx.HydraulicCylinder(
-            *POINTS, 0.0, areas=(1.0, 1.0), closed=1.0, stroke=1.0, valve=1.0, supply=1e7, dead_volume=1.0,
-            bulk_modulus=x,
-        ), 1.0, POSITIVE,
+        lambda x: lx.HydraulicCylinder(*POINTS, 0.0, **HYDRAULIC, closed=1.0, bulk_modulus=x), 1.0, POSITIVE,
     ),
     "HydraulicActuator: leakage": (
-        lambda x: lx.HydraulicActuator(
-            "pin", 0.0, areas=(1.0, 1.0), closed=-1.0, stroke=1.0, valve=1.0, supply=1e7, dead_volume=1.0, leakage=x,
-        ), 0.0, NOT_NEGATIVE,
+        lambda x: lx.HydraulicActuator("pin", 0.0, **HYDRAULIC, closed=-1.0, leakage=x), 0.0, NOT_NEGATIVE,
     ),
     "PneumaticSpring: area": (
         lambda x: lx.PneumaticSpring(*POINTS, area=x, free_length=1.0, pressure=1e6), 1.0, POSITIVE,
@@ -138,23 +130,17 @@ CASES = {
     ),
     "MaxwellElement: damping": (lambda x: lx.MaxwellElement(*POINTS, 1.0, x), 1.0, POSITIVE),
     "ContactLaw: stiffness": (lx.ContactLaw, 1.0, POSITIVE),
-    "JointLimit: lower": (lambda x: lx.JointLimit("pin", lx.ContactLaw(1.0), lower=x), -1.0, NONE),
+    "JointLimit: lower": (lambda x: lx.JointLimit("pin", LAW, lower=x), -1.0, NONE),
     "Impact: restitution": (lambda x: lx.Impact("pin", lower=0.0, restitution=x), 0.5, [*NONE, -0.1, 1.1]),
-    "Contact: radius": (
-        lambda x: lx.Contact(lx.Sphere(LINK, x), lx.Plane(lx.GROUND), lx.ContactLaw(1.0)), 1.0, NOT_NEGATIVE,
-    ),
+    "Contact: radius": (lambda x: lx.Contact(lx.Sphere(LINK, x), lx.Plane(lx.GROUND), LAW), 1.0, NOT_NEGATIVE),
     "WheelRailContact: span": (
-        lambda x: lx.WheelRailContact(LINK, lx.GROUND, radius=jnp.cos, height=jnp.sin, span=x, law=lx.ContactLaw(1.0)),
-        np.array([-1.0, 1.0]),
-        [[1.0, -1.0], [0.0, 0.0], [np.nan, 1.0], [0.0, np.inf]],
+        lambda x: lx.WheelRailContact(LINK, lx.GROUND, radius=jnp.cos, height=jnp.sin, span=x, law=LAW), *RANGE,
     ),
     "WheelOnRail: offset": (
         lambda x: lx.WheelOnRail("w", LINK, lx.GROUND.at(x), radius=jnp.cos, height=jnp.sin, span=[0.0, 1.0]), *VECTOR,
     ),
     "Creep: friction": (lambda x: lx.Creep(1.0, 1.0, x), 0.3, POSITIVE),
-    "Clearance": (
-        lambda x: lx.Clearance(*POINTS, clearance=x, radius=1.0, law=lx.ContactLaw(1.0)), 0.1, POSITIVE,
-    ),
+    "Clearance": (lambda x: lx.Clearance(*POINTS, clearance=x, radius=1.0, law=LAW), 0.1, POSITIVE),
     "Material: modulus": (lambda x: lx.Material(x, 0.3, 1.0), 1.0, POSITIVE),
     "Material: Poisson's ratio": (lambda x: lx.Material(1.0, x, 1.0), 0.5, [*NONE, -1.0, 0.6]),
     "Material: density": (lambda x: lx.Material(1.0, 0.3, x), 1.0, POSITIVE),

@@ -30,8 +30,7 @@ SIZE = {"excavator": 5.0}  # [m]; others have one of about a metre or less
 def drawn(name):
     scene = SCENES[name]
     mechanism = scene.mechanism(scene.settings())
-    topology = mechanism.topology
-    return mechanism, lx.State(np.zeros(topology.num_coordinates), np.zeros(topology.num_speeds), topology)
+    return mechanism, lx.State.as_drawn(mechanism)
 
 
 def check(name, mechanism, state):
@@ -83,12 +82,6 @@ def test_delta_below_its_centre():
     np.testing.assert_allclose(at.orientation("platform")[0], np.eye(3), atol=1e-14)
 
 
-def apart(at, ends):
-    """Distances of points [m]; an end is (body, frame)."""
-    first, second = (at.position(*end)[0] for end in ends)
-    return np.linalg.norm(second - first)
-
-
 @pytest.mark.parametrize("name", ["five-bar", "watt-six-bar", "stephenson-six-bar", "strandbeest", "hoberman"])
 def test_points_start_on_the_closed_form(name):
     scene = SCENES[name]
@@ -104,9 +97,9 @@ def test_bars_have_their_lengths():
     ends |= {"f": ("f", "K", "Q"), "g": ("foot", "H", "Q"), "h": ("foot", "Q", "F"), "i": ("foot", "H", "F")}
     ends |= {"j": ("j", "A", "T"), "k": ("k", "A", "H")}
     for leg in (1, 2):
-        for side, (body, first, second) in ends.items():
-            found = apart(at, [(f"{body}_{leg}", first), (f"{body}_{leg}", second)])
-            np.testing.assert_allclose(found, settings[side], atol=1e-14)
+        for side, (body, *pins) in ends.items():
+            first, second = (at.position(f"{body}_{leg}", pin)[0] for pin in pins)
+            np.testing.assert_allclose(np.linalg.norm(second - first), settings[side], atol=1e-14)
     # Jansen's foot is below all else.
     assert at.position("foot_1", "F")[0, 1] < -0.7
 
@@ -151,18 +144,18 @@ def test_lengths_that_make_no_machine(name, changes, told):
 def test_lengths_have_derivatives():
     """The depth of a leg's toe by all lengths, against differences."""
     scene = SCENES["strandbeest"]
-    toe = jax.jit(lambda numbers: toe_of(scene.mechanism(scene.settings() | {"legs": 1} | numbers)))
+
+    @jax.jit
+    def toe(numbers):
+        foot = scene.mechanism(scene.settings() | {"legs": 1} | numbers).body("foot_1")
+        return (foot.drawn_at + foot.frames["F"])[1]
+
     lengths = {name: jnp.asarray(scene.parameters[name]) for name in "abcdefghijklm"}
     slopes = jax.jit(jax.grad(toe))(lengths)
     for name in "bk":
         step = 1e-6
         above, below = (toe(lengths | {name: lengths[name] + sign * step}) for sign in (1.0, -1.0))
         np.testing.assert_allclose(slopes[name], (above - below) / (2.0 * step), rtol=1e-7)
-
-
-def toe_of(mechanism):
-    foot = next(body for body in mechanism.bodies if body.name == "foot_1")
-    return (foot.drawn_at + foot.frames["F"])[1]
 
 
 @pytest.mark.slow

@@ -96,7 +96,6 @@ MJCF = """
   </actuator>
 </mujoco>
 """
-NAMES = ("hinge", "slide", "wrist")
 
 
 def moved(mechanism):

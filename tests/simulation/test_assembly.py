@@ -35,13 +35,6 @@ def test_the_guess_chooses_the_assembly_mode():
     assert folded.q[place["guide"]][0] < 0.0
 
 
-def test_a_loop_that_cannot_close_names_joint_and_gap():
-    with pytest.raises(
-        lx.AssemblyError, match=r"joint 'wrist_pin' does not close: a gap of 0\.\d+ m remains.*'bearing'"
-    ):
-        lx.assemble(crank_slider(rod=0.5), {"bearing": 1.2}, {"bearing": 0.0})
-
-
 def test_contradicting_positions_and_speeds():
     ask = lambda guide, speed: lx.assemble(
         crank_slider(rod=1.0), {"bearing": 0.3, "guide": guide}, {"bearing": 1.0, "guide": speed}
@@ -57,49 +50,27 @@ def driven_slider(rod=1.5):
 
 
 REACHED = np.cos(1.2) + np.sqrt(1.5**2 - np.sin(1.2) ** 2)  # by the guide, where the drive starts
+HELD, HOLDS = ", and drive 'motor' holds it at", "drive 'motor' holds 'bearing' at"
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"),
+    ("rod", "positions", "speeds", "told"),
     [
-        (
-            ({"bearing": 0.4}, {"bearing": 2.0}),
-            r"position .* 'bearing' is 0\.4 rad, and drive 'motor' holds it at 1\.2 rad at t = 0 s; leave",
-        ),
-        (
-            ({"bearing": 1.2}, {"bearing": 3.0}),
-            r"speed .* 'bearing' is 3 rad/s, and drive 'motor' holds it at 2 rad/s at t = 0 s; leave",
-        ),
-        (
-            ({"guide": 0.4}, {"guide": 0.0}),
-            r"does not close.*positions held: 'guide'; drive 'motor' holds 'bearing' at 1\.2 rad",
-        ),
-        (
-            ({"guide": REACHED}, {"guide": 0.4}),
-            r"'guide' is missed by .*given \(drive 'motor' holds 'bearing' at 2 rad/s\)",
-        ),
+        (1.5, {"bearing": 0.4}, {"bearing": 2.0}, rf"position.*'bearing' is 0\.4 rad{HELD} 1\.2 rad at t = 0 s; leave"),
+        (1.5, {"bearing": 1.2}, {"bearing": 3.0}, rf"speed.*'bearing' is 3 rad/s{HELD} 2 rad/s at t = 0 s; leave"),
+        (1.5, {"guide": 0.4}, {"guide": 0.0}, rf"does not close.*positions held: 'guide'; {HOLDS} 1\.2 rad"),
+        (1.5, {"guide": REACHED}, {"guide": 0.4}, rf"'guide' is missed by .*given \({HOLDS} 2 rad/s\)"),
+        (0.5, {}, {}, rf"positions held: none; {HOLDS} 1\.2 rad"),
     ],
 )
-def test_errors_tell_what_drives_hold(asked, told):
+def test_errors_tell_what_drives_hold(rod, positions, speeds, told):
     with pytest.raises(lx.AssemblyError, match=told):
-        lx.assemble(driven_slider(), *asked)
-
-
-def test_lengths_that_fit_no_place_of_a_drive_name_it():
-    with pytest.raises(lx.AssemblyError, match=r"positions held: none; drive 'motor' holds 'bearing' at 1\.2 rad"):
-        lx.assemble(driven_slider(rod=0.5))
+        lx.assemble(driven_slider(rod), positions, speeds)
 
 
 def test_what_a_drive_asks_may_be_given_too():
     state = lx.assemble(driven_slider(), {"bearing": 5.2}, {"bearing": 2.0}, t=2.0)
     np.testing.assert_allclose([state.q[0], state.v[0]], [5.2, 2.0], atol=1e-12)
-
-
-def test_unknown_names_and_wrong_numbers():
-    with pytest.raises(ValueError, match=r"unknown joint or body 'pin'.*; known joints: 'bearing', "):
-        lx.assemble(crank_slider(), {"pin": 1.0})
-    with pytest.raises(ValueError, match="position of joint 'bearing' is"):
-        lx.assemble(crank_slider(), {"bearing": float("nan")})
 
 
 def test_derivative_of_an_assembled_state():
@@ -169,8 +140,6 @@ def test_a_ball_is_held_where_it_is_asked_and_turns_as_asked():
         lx.assemble(mechanism, {("ball", 1): 0.1})
     with pytest.raises(ValueError, match=r"speed of joint 'ball': index 3; it has 3 speeds"):
         lx.assemble(mechanism, speeds={("ball", 3): 0.1})
-    with pytest.raises(ValueError, match=r"its quaternion is no rotation"):
-        lx.assemble(mechanism, {"ball": np.zeros(4)})
     with pytest.raises(ValueError, match=r"position of joint 'ball' is one number; the joint has 4"):
         lx.assemble(mechanism, {"ball": 0.1})
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mechanisms import crank_slider
+from mechanisms import crank_slider, pendulum
 from plans import FEW
 from refusals import Shown, refused
 
@@ -24,15 +24,7 @@ MECHANISM = crank_slider()
 N_Q, N_V = MECHANISM.topology.num_coordinates, MECHANISM.topology.num_speeds
 STATE = lx.State(jnp.zeros(N_Q), jnp.zeros(N_V))
 FIRST = next(iter(MECHANISM.topology.coordinates))
-
-
-def _pendulum(law):
-    link = lx.rod("link", 1.0, 1.0)
-    pin = lx.Revolute("pin", lx.GROUND, link.at("base"), "z")
-    return lx.Mechanism([link], [pin], [lx.Gravity([0.0, -9.81, 0.0]), law(link)])
-
-
-ONE = _pendulum(lambda link: lx.JointDamper("pin", 0.1))
+ONE, ARM = pendulum(forces=[lx.JointDamper("hinge", 0.1)]), lx.rod("arm", 1.0, 1.0)
 AT_REST = lx.State(jnp.zeros(1), jnp.zeros(1))
 
 
@@ -128,6 +120,7 @@ ACCURACY = {
     "atol": [0.0, -1e-8, 1e308, np.nan, "fine", True],
     "clearance": [-1e-2, np.nan, "far", True],
     "projection": ["always", None, True],
+    "metric": ["euclid"],
 }
 TANGENT_SPACE = {
     "rank_tolerance": [0.0, -1.0, np.inf, "fine"],
@@ -276,14 +269,12 @@ def test_what_cannot_move_is_named():
 
 
 def test_a_drive_that_is_not_finite_is_named():
-    link = lx.rod("link", 1.0, 1.0)
-    pin = lx.Revolute("pin", lx.GROUND, link.at("base"), "z")
-    mechanism = lx.Mechanism([link], [pin], constraints=[lx.Drive("motor", "pin", lambda t: jnp.sqrt(t - 2.0))])
+    mechanism = pendulum(constraints=[lx.Drive("motor", "hinge", lambda t: jnp.sqrt(t - 2.0))])
     refused(lambda: lx.simulate(mechanism, AT_REST, t1=1.0), "'motor'", "not finite")
 
 
 def test_a_batch_is_named():
-    batch = jax.vmap(lambda mass: _pendulum(lambda link: lx.Damper(lx.GROUND, link, mass)))(jnp.ones(3))
+    batch = jax.vmap(lambda damping: pendulum(forces=[lx.Damper(lx.GROUND, ARM, damping)]))(jnp.ones(3))
     batch = eqx.tree_at(lambda m: m.bodies[0].mass, batch, jnp.ones(3))
     refused(lambda: lx.simulate(batch, AT_REST, t1=1.0), "batch", "(3,)")
 
@@ -310,12 +301,9 @@ LAWS = {
 @pytest.mark.parametrize("case", LAWS)
 @pytest.mark.parametrize("kind", ["JointTorque", "PointForce"])
 def test_bad_laws_are_named(case, kind):
-    along = {
-        "JointTorque": lambda link: lx.JointTorque("pin", LAWS[case]),
-        "PointForce": lambda link: lx.PointForce(link.at("tip"), LAWS[case]),
-    }
-    mechanism = _pendulum(along[kind])
-    refused(lambda: lx.simulate(mechanism, AT_REST, t1=1.0), kind, "'pin'" if kind == "JointTorque" else "'link'")
+    on, named = {"JointTorque": ("hinge", "'hinge'"), "PointForce": (ARM.at("tip"), "'arm'")}[kind]
+    mechanism = pendulum(forces=[getattr(lx, kind)(on, LAWS[case])])
+    refused(lambda: lx.simulate(mechanism, AT_REST, t1=1.0), kind, named)
 
 
 class Bad(lx.AbstractForce):
@@ -336,7 +324,7 @@ LOADS = {
 
 @pytest.mark.parametrize("case", LOADS)
 def test_bad_loads_are_named(case):
-    mechanism = _pendulum(lambda link: Bad(LOADS[case]))
+    mechanism = pendulum(forces=[Bad(LOADS[case])])
     refused(lambda: lx.simulate(mechanism, AT_REST, t1=1.0), "Bad")
 
 
@@ -509,10 +497,10 @@ def test_numbers_of_a_users_own_may_be_what_they_are():
     first = lambda rows, t, motion: rows[0]
     made = {
         "a force": lambda limit: Wall(limit),
-        "a function": lambda limit: lx.JointTorque("pin", jax.tree_util.Partial(first, jnp.stack([1.0, limit]))),
+        "a function": lambda limit: lx.JointTorque("hinge", jax.tree_util.Partial(first, jnp.stack([1.0, limit]))),
     }
     for force in made.values():
-        assert jax.jit(lambda limit, force=force: sound_numbers(_pendulum(lambda link: force(limit))))(jnp.nan)
+        assert jax.jit(lambda limit, force=force: sound_numbers(pendulum(forces=[force(limit)])))(jnp.nan)
 
 
 def test_what_was_marked_is_told_outside_of_transformations_too():

@@ -53,16 +53,16 @@ class Alike(lx.AbstractConstraint):
         return jnp.array([apart[0], apart[1], first - second])
 
 
-def puck(*constraints, gravity=9.81):
-    bead = lx.point_mass("bead", 2.0)
-    joints = [lx.Rectangular("table", lx.GROUND, bead, "z")]
-    forces = [lx.Gravity([0.0, -gravity, 0.0])]
-    return lx.Mechanism([bead], joints, forces, constraints), bead
+BEAD = lx.point_mass("bead", 2.0)
+
+
+def puck(constraint, gravity=9.81):
+    joints = [lx.Rectangular("table", lx.GROUND, BEAD, "z")]
+    return lx.Mechanism([BEAD], joints, [lx.Gravity([0.0, -gravity, 0.0])], [constraint])
 
 
 def on_parabola(radius):
-    bead = lx.point_mass("bead", 2.0)
-    return puck(OnParabola("wire", bead.reference, radius))[0]
+    return puck(OnParabola("wire", BEAD.reference, radius))
 
 
 def test_a_bead_on_a_wire():
@@ -113,8 +113,7 @@ def test_derivatives_of_its_assembly(derivative):
 
 def test_a_bead_on_a_turning_line():
     """r̈ = ω² r: away from the axis by cosh; the reaction is 2 m ω ṙ, and its power all that the energy gains."""
-    bead = lx.point_mass("bead", 2.0)
-    mechanism, _ = puck(Rotating("arm", bead.reference, 1.5), gravity=0.0)
+    mechanism = puck(Rotating("arm", BEAD.reference, 1.5), gravity=0.0)
     state = lx.State(jnp.array([0.2, 0.0]), jnp.array([0.0, 0.3]))
     found = lx.simulate(mechanism, state, t1=1.2, accuracy=lx.PRECISE)
     reaction, unaccounted = eqx.filter_jit(lambda found: (found.reaction("arm"), found.unaccounted_energy()))(found)
@@ -169,4 +168,4 @@ class Wrong(lx.AbstractConstraint):
 )
 def test_mistakes_are_named(mistake, told):
     with pytest.raises(ValueError, match=told):
-        puck(Wrong("wire", lx.point_mass("bead", 2.0).reference, mistake))
+        puck(Wrong("wire", BEAD.reference, mistake))

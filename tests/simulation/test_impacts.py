@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import four_bar, pendulum
+from scipy.special import ellipk
 
 import linkax as lx
 from linkax.equations.configuration import configure
@@ -87,28 +89,20 @@ def test_derivatives_through_ten_impacts():
             np.testing.assert_allclose(found, exact, rtol=1e-6)
 
 
-def pendulum(stop, restitution=0.8):
-    """A rod that hangs from a hinge, against a stop at the angle from straight down."""
-    rod = lx.rod("rod", 1.0, 2.0)
-    hinge = lx.Revolute("hinge", lx.GROUND, rod.at("base"), "z")
-    impact = lx.Impact("hinge", lower=stop - np.pi / 2.0, restitution=restitution, name="stop")
-    return lx.Mechanism([rod], [hinge], [GRAVITY, impact])
-
-
 @pytest.mark.slow
 def test_a_pendulum_hit_at_the_bottom_ten_times():
     """Each hit leaves the square of the restitution of the energy; the time of a swing is an elliptic integral."""
     angle, restitution = 1.0, 0.9
-    agm = lambda a, b: a if abs(a - b) < 1e-15 else agm((a + b) / 2.0, np.sqrt(a * b))
-    half = lambda top: np.pi / np.sqrt(1.5 * G) / agm(1.0, np.cos(top / 2.0))  # half a period at an amplitude
+    half = lambda top: 2.0 / np.sqrt(1.5 * G) * ellipk(np.sin(top / 2.0) ** 2)  # half a period at an amplitude
     tops = [angle]
     for _ in range(10):
         tops.append(2.0 * np.arcsin(restitution * np.sin(tops[-1] / 2.0)))
     ends = half(angle) / 2.0 + np.cumsum([half(top) for top in tops[1:]])
     ts = np.concatenate([[0.0], ends - np.array([half(top) for top in tops[1:]]) / 2.0])
     start = lx.State(jnp.array([angle - np.pi / 2.0]), jnp.zeros(1))
-    saveat = diffrax.SaveAt(ts=ts)
-    run = lx.simulate(pendulum(0.0, restitution), start, t1=ts[-1], accuracy=lx.Accuracy(rtol=1e-12), saveat=saveat)
+    stop, saveat = lx.Impact("hinge", lower=-np.pi / 2.0, restitution=restitution, name="stop"), diffrax.SaveAt(ts=ts)
+    swinging = pendulum(mass=2.0, forces=[stop])
+    run = lx.simulate(swinging, start, t1=ts[-1], accuracy=lx.Accuracy(rtol=1e-12), saveat=saveat)
     np.testing.assert_array_equal(run.impacts("stop"), np.arange(11))
     np.testing.assert_allclose(run.q[:, 0] + np.pi / 2.0, tops, atol=1e-9)
     np.testing.assert_allclose(run.v[:, 0], 0.0, atol=1e-9)
@@ -116,34 +110,28 @@ def test_a_pendulum_hit_at_the_bottom_ten_times():
     np.testing.assert_allclose(energy, energy[0] * restitution ** (2 * np.arange(11)), rtol=1e-9)
 
 
-def four_bar(numbers):
+def hit(numbers):
     """A four-bar whose tip of the coupler meets a wall, and whose rocker has a stop, by (restitution, wall, stop)."""
     restitution, wall, stop = numbers
-    crank, coupler, rocker = lx.rod("crank", 0.3, 1.0), lx.rod("coupler", 0.7, 1.0), lx.rod("rocker", 0.6, 1.0)
-    joints = [
-        lx.Revolute("A", lx.GROUND, crank.at("base"), "z"),
-        lx.Revolute("B", crank.at("tip"), coupler.at("base"), "z"),
-        lx.Revolute("C", coupler.at("tip"), rocker.at("tip"), "z", cut=True),
-        lx.Revolute("D", lx.GROUND.at([0.8, 0.0, 0.0]), rocker.at("base"), "z"),
-    ]
     facing_left = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     plane = lx.Plane(lx.GROUND.at(jnp.stack([wall, 0.0, 0.0]), facing_left))
     impacts = [
-        lx.Impact(plane, lx.Sphere(coupler.at("tip"), 0.05), restitution=restitution, name="wall"),
-        lx.Impact("D", upper=stop, restitution=restitution, name="stop"),
+        lx.Impact(plane, lx.Sphere(lx.rod("coupler", 0.7, 1.0).at("tip"), 0.05), restitution=restitution, name="wall"),
+        lx.Impact("rocker_bearing", upper=stop, restitution=restitution, name="stop"),
     ]
-    return lx.Mechanism([crank, coupler, rocker], joints, [GRAVITY, *impacts])
+    return four_bar(crank=0.3, coupler=0.7, rocker=0.6, ground=0.8, cut="rocker_pin", forces=impacts)
 
 
 FOUR_BAR = jnp.array([0.8, 0.8, 2.1])
 
 
-# With the crank at 1.2 rad and -9 rad/s, as joints D, A and B; a run closes the loop to all digits.
+# With the crank at 1.2 rad and -9 rad/s, as bearings of rocker and crank and the crank's pin; a run closes the loop to
+# all digits.
 START = lx.State(jnp.array([1.68269576, 1.2, -0.73061624]), jnp.array([-3.20563953, -9.0, 10.91118997]))
 
 
 def simulated(numbers, saveat, start=START, **options):
-    return lx.simulate(four_bar(numbers), start, t1=1.0, accuracy=PRECISE, saveat=saveat, **options)
+    return lx.simulate(hit(numbers), start, t1=1.0, accuracy=PRECISE, saveat=saveat, **options)
 
 
 @pytest.mark.parametrize("formulation", ["tangent-space", pytest.param("lagrange-multipliers", marks=pytest.mark.slow)])
@@ -217,21 +205,18 @@ def test_spheres_swap_speeds():
     assert run.impacts("hit")[-1] == 1
 
 
+BODY, FLOOR = lx.point_mass("a", 1.0), lx.Plane(lx.GROUND)
+
+
 @pytest.mark.parametrize(
     ("words", "make"),
     [
         ("neither lower nor upper", lambda: lx.Impact("a", restitution=0.5)),
         ("restitution is 1.5", lambda: lx.Impact("a", lower=0.0, restitution=1.5)),
         ("slowest .* is 0.0", lambda: lx.Impact("a", lower=0.0, restitution=0.5, slowest=0.0)),
-        (
-            "shapes have neither",
-            lambda: lx.Impact(lx.Sphere(lx.GROUND, 1.0), lx.Plane(lx.point_mass("a", 1.0)), restitution=0.5, lower=0.0),
-        ),
-        (
-            "both shapes are on body 'ground'",
-            lambda: lx.Impact(lx.Sphere(lx.GROUND, 1.0), lx.Plane(lx.GROUND), restitution=0.5),
-        ),
-        ("both shapes are planes", lambda: lx.Impact(lx.Plane(lx.GROUND), lx.Plane(lx.GROUND), restitution=0.5)),
+        ("shapes have neither", lambda: lx.Impact(FLOOR, lx.Sphere(BODY, 1.0), restitution=0.5, lower=0.0)),
+        ("both shapes are on body 'ground'", lambda: lx.Impact(FLOOR, lx.Sphere(lx.GROUND, 1.0), restitution=0.5)),
+        ("both shapes are planes", lambda: lx.Impact(FLOOR, lx.Plane(BODY), restitution=0.5)),
         ("a shape is 'a'", lambda: lx.Impact("a", "b", restitution=0.5)),
     ],
     ids=lambda entry: entry if isinstance(entry, str) else "",

@@ -1,6 +1,7 @@
 """Internal states of force elements: integrated, saved, read and differentiated with the motion."""
 
 import dataclasses
+from collections.abc import Callable
 
 import diffrax
 import equinox as eqx
@@ -246,19 +247,11 @@ class WithoutRates(lx.AbstractForce):
         return lx.Load.none(motion.system)
 
 
-class OtherRates(WithoutRates):
+class WithRates(WithoutRates):
+    of: Callable = eqx.field(static=True)
+
     def rates(self, t, motion, states):
-        return {"y": 0.0}
-
-
-class LongRates(WithoutRates):
-    def rates(self, t, motion, states):
-        return {"x": jnp.zeros(2)}
-
-
-class Endless(WithoutRates):
-    def rates(self, t, motion, states):
-        return {"x": 1.0 / states["x"]}
+        return self.of(states["x"])
 
 
 class NoStates(WithoutRates):
@@ -268,22 +261,22 @@ class NoStates(WithoutRates):
 
 
 @pytest.mark.parametrize(
-    ("kind", "message"),
+    ("force", "message"),
     [
-        (WithoutRates, "WithoutRates has internal states, and no rates; define rates"),
-        (OtherRates, "OtherRates: its rates are of 'y'; give those of 'x'"),
-        (LongRates, "LongRates: the rate of 'x' has shape \\(2,\\)"),
-        (NoStates, "NoStates: state 'x' is 0.0; give a dictionary"),
+        (WithoutRates(), "WithoutRates has internal states, and no rates; define rates"),
+        (WithRates(lambda x: {"y": 0.0}), "WithRates: its rates are of 'y'; give those of 'x'"),
+        (WithRates(lambda x: {"x": jnp.zeros(2)}), "WithRates: the rate of 'x' has shape \\(2,\\)"),
+        (NoStates(), "NoStates: state 'x' is 0.0; give a dictionary"),
     ],
 )
-def test_mistakes_are_told(kind, message):
+def test_mistakes_are_told(force, message):
     with pytest.raises(ValueError, match=message):
-        turned(pendulum(forces=[kind()]))
+        turned(pendulum(forces=[force]))
 
 
 def test_a_rate_that_is_not_finite_is_told():
-    with pytest.raises(lx.SimulationError, match="A rate of the internal states of Endless is not finite"):
-        turned(pendulum(forces=[Endless()]))
+    with pytest.raises(lx.SimulationError, match="A rate of the internal states of WithRates is not finite"):
+        turned(pendulum(forces=[WithRates(lambda x: {"x": 1.0 / x})]))
 
 
 def test_states_are_asked_of_elements_that_have_them(driven):

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import four_bar
+from mechanisms import four_bar, pendulum
 
 import linkax as lx
 from linkax.equations.configuration import configure
@@ -14,24 +14,22 @@ from linkax.equations.system import system_of
 from linkax.simulation.explain.diagnosis import massless_bodies
 
 MASS, LENGTH, GRAVITY = 2.0, 0.7, 9.81
+HANGING = lx.State(jnp.full(1, -np.pi / 2.0), jnp.zeros(1))
 
 
-def pendulum(*inertias):
-    """A rod that hangs along y from a hinge, where its angle is zero."""
-    link = lx.rod_between("link", [0.0, 0.0, 0.0], [0.0, -LENGTH, 0.0], MASS)
-    hinge = lx.Revolute("hinge", lx.GROUND, link.at("base"), axis="z")
-    rotors = [lx.JointInertia("hinge", inertia) for inertia in inertias]
-    return lx.Mechanism([link], [hinge], [lx.Gravity([0.0, -GRAVITY, 0.0]), *rotors])
+def geared(*inertias):
+    """A pendulum with rotors at its hinge."""
+    return pendulum(LENGTH, MASS, GRAVITY, [lx.JointInertia("hinge", inertia) for inertia in inertias])
 
 
 def exact(angle, inertia):
     """The acceleration of the pendulum."""
-    return -MASS * GRAVITY * LENGTH / 2.0 * jnp.sin(angle) / (MASS * LENGTH**2 / 3.0 + inertia)
+    return -MASS * GRAVITY * LENGTH / 2.0 * jnp.cos(angle) / (MASS * LENGTH**2 / 3.0 + inertia)
 
 
 def test_a_pendulum_swings_more_slowly():
     at = lambda inertia: lx.Solution.of_state(
-        pendulum(inertia / 3.0, 2.0 * inertia / 3.0), lx.State(jnp.array([0.8]), jnp.array([2.0]))
+        geared(inertia / 3.0, 2.0 * inertia / 3.0), lx.State(jnp.array([0.8]), jnp.array([2.0]))
     )
     acceleration, slope = jax.value_and_grad(lambda inertia: at(inertia).joint_acceleration("hinge")[0])(0.4)
     np.testing.assert_allclose(acceleration, exact(0.8, 0.4), rtol=1e-12)
@@ -40,10 +38,10 @@ def test_a_pendulum_swings_more_slowly():
 
 
 def test_frequencies_and_inverse_dynamics_count_it():
-    mechanism = pendulum(0.4)
-    found = lx.linearise(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)))
-    np.testing.assert_allclose(found.natural_frequencies, [np.sqrt(-jax.grad(exact)(0.0, 0.4))], rtol=1e-10)
-    needed = lx.inverse_dynamics(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), {"hinge": 3.0})
+    mechanism = geared(0.4)
+    found = lx.linearise(mechanism, HANGING)
+    np.testing.assert_allclose(found.natural_frequencies, [np.sqrt(-jax.grad(exact)(-np.pi / 2.0, 0.4))], rtol=1e-10)
+    needed = lx.inverse_dynamics(mechanism, HANGING, {"hinge": 3.0})
     np.testing.assert_allclose(needed.forces["hinge"], [3.0 * (MASS * LENGTH**2 / 3.0 + 0.4)], rtol=1e-12)
 
 
@@ -137,7 +135,7 @@ def test_the_mass_matrix_is_that_of_mujoco():
 
 
 def test_its_force_is_read_by_accelerations():
-    here = lx.Solution.of_state(pendulum(0.4), lx.State(jnp.zeros(1), jnp.zeros(1)))
+    here = lx.Solution.of_state(geared(0.4), HANGING)
     with pytest.raises(ValueError, match=r"JointInertia on 'hinge' .* read -inertia \* solution.joint_acceleration"):
         here.force("JointInertia on 'hinge'")
     assert "inertia 0.4 kg m²" in repr(here.mechanism)

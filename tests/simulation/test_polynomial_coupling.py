@@ -54,6 +54,7 @@ def test_two_hinges():
     np.testing.assert_allclose(found.reaction("coupling"), torque, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_by_coefficients():
     """Of an assembled coordinate and of its speed: xᵏ, and its rate."""
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from mechanisms import pendulum
 
 import linkax as lx
 
@@ -79,9 +80,7 @@ def test_derivatives_by_an_array_that_drives_close_over():
 
 def cruised(speed, start):
     """Angle and speed after half a second of an arm that turns at constant speed."""
-    arm = lx.rod("arm", 1.0, 1.0)
-    motor = lx.Drive("motor", "hinge", speed=speed, start=start)
-    mechanism = lx.Mechanism([arm], [lx.Revolute(*HINGE, arm.at("base"), "z")], constraints=[motor])
+    mechanism = pendulum(gravity=0.0, constraints=[lx.Drive("motor", "hinge", speed=speed, start=start)])
     found = lx.simulate(mechanism, lx.assemble(mechanism), t1=0.5, saveat=diffrax.SaveAt(t1=True))
     return jnp.array([found.q[-1, 0], found.v[-1, 0]])
 
@@ -112,19 +111,12 @@ def test_a_drive_at_constant_speed_goes_on_or_is_held(moves):
 
 def test_a_mechanism_whose_functions_have_changed_is_refused():
     speeds = {"motor": 2.0}
-    arm = lx.rod("arm", 1.0, 1.0)
-    hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), "z")
-    build = lambda: lx.Mechanism(
-        [arm], [hinge], constraints=[lx.Drive("motor", "hinge", lambda t: speeds["motor"] * t)]
-    )
+    build = lambda: pendulum(constraints=[lx.Drive("motor", "hinge", lambda t: speeds["motor"] * t)])
     mechanism, now = build(), lambda mechanism: mechanism.constraints[0].right_side(0.5)
     assert now(mechanism) == 1.0
     speeds["motor"] = 3.0
-    for use in (
-        now,
-        lx.assemble,
-        lambda mechanism: lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=1.0),
-    ):
+    run = lambda mechanism: lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=1.0)
+    for use in (now, lx.assemble, run):
         with pytest.raises(ValueError, match=r"drive 'motor': what its function reads \(speeds\) has changed .* anew"):
             use(mechanism)
     assert now(build()) == 1.5

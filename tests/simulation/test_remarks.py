@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from known_answers import turning
+from test_step_control import REST, held_weight
 
 import linkax as lx
 from linkax.linalg.spectral_radius import spectral_radius
@@ -30,12 +31,8 @@ def carried(length):
 
 
 def held(stiffness):
-    """A weight on a slide, held by a spring: with the program of test_step_control."""
-    weight = lx.point_mass("weight", 1.0)
-    slide = lx.Prismatic("slide", lx.GROUND, weight, axis="y")
-    forces = [GRAVITY, lx.JointSpring("slide", stiffness), lx.JointDamper("slide", 0.0)]
-    start = lx.State(jnp.zeros(1), jnp.zeros(1))
-    return lx.simulate(lx.Mechanism([weight], [slide], forces), start, t1=0.5, max_steps=4096)
+    """A weight held by a spring: with the program of test_step_control."""
+    return lx.simulate(held_weight(stiffness, 0.0), REST, t1=0.5, max_steps=4096)
 
 
 def from_angle(angle, speed, gravity, **options):

@@ -60,6 +60,7 @@ def test_a_stiff_problem(rate):
     np.testing.assert_allclose(disturbed[-1], np.sin(2.0), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_steps():
     end = lambda torque, adjoint=None: _solve(16, torque, jnp.array([1.0, 0.2]), adjoint=adjoint)[-1, 0]
     forwards, backwards = jax.jacfwd(lambda torque: end(torque, diffrax.ForwardMode()))(0.3), jax.grad(end)(0.3)

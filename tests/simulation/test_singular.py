@@ -1,7 +1,6 @@
 """Through singular configurations at any tolerance, with any step."""
 
 import itertools
-from typing import ClassVar
 
 import diffrax
 import numpy as np
@@ -54,24 +53,12 @@ def test_row_of_four_bars_stays_on_its_branch(count):
     assert np.all(found.rank() == 2 * count)
 
 
-class RK4(diffrax.AbstractERK):
-    """The classical method, without an error estimate."""
-
-    tableau: ClassVar = diffrax.ButcherTableau(
-        c=np.array([0.5, 0.5, 1.0]),
-        a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
-        b_sol=np.array([1.0, 2.0, 2.0, 1.0]) / 6.0,
-        b_error=np.array([1.0, 2.0, 2.0, 1.0]) / 6.0 - np.array([1.0, 0.0, 0.0, 0.0]),
-    )
-    interpolation_cls: ClassVar = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
-
-    def order(self, terms):
-        return 4
-
-
 @pytest.mark.parametrize(
     ("solver", "name"),
-    [pytest.param(RK4(), "SC2", id="RK4"), pytest.param(diffrax.Dopri8(), "FL1", id="Dopri8", marks=pytest.mark.slow)],
+    [
+        pytest.param(lx.RungeKutta4(), "SC2", id="RK4"),
+        pytest.param(diffrax.Dopri8(), "FL1", id="Dopri8", marks=pytest.mark.slow),
+    ],
 )
 def test_smaller_fixed_steps_are_never_worse(solver, name):
     run = PASSING[name]._replace(t1=5.0)

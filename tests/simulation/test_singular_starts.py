@@ -79,14 +79,6 @@ def test_errors_of_many_starts_lie_on_one_curve(starts):
         assert np.max(np.abs(tip[:, :2] - expected)) <= 5.0 * rtol + 1e-11
 
 
-@pytest.mark.slow
-def test_members_of_a_batch_equal_single_runs():
-    starts = anywhere()
-    together = starts.batch(1e-12)
-    alone = [starts.run(q, v, lx.PRECISE).q for q, v in zip(starts.q[::8], starts.v[::8], strict=True)]
-    assert np.max(np.abs(together.q[::8] - np.stack(alone))) <= 1e-10
-
-
 # The crank-slider with crank and rod on each other: the slider stands still, or moves.
 UPRIGHT = {"bearing": np.pi / 2, "guide": 0.0}
 Q_UPRIGHT = np.array([np.pi / 2, 0.0, -np.pi])

@@ -203,7 +203,7 @@ def test_iterations_end_where_rounding_within_the_tolerance_is_left(tolerance, e
 REST = lx.State(jnp.zeros(1), jnp.zeros(1))
 
 
-def held(stiffness, damping):
+def held_weight(stiffness, damping):
     """A weight on a slide, held by a spring and a damper."""
     weight = lx.point_mass("weight", 1.0)
     slide = lx.Prismatic("slide", lx.GROUND, weight, axis="y")
@@ -217,7 +217,7 @@ def held(stiffness, damping):
 )
 def test_an_element_that_chooses_the_steps_is_named(stiffness, damping, duration, named):
     """By its rate, √(k / m) or c / m, and not where the motion chooses them, however long it takes."""
-    mechanism, match = held(stiffness, damping), rf"{named}.*'slide'.* 1\.0e\+04 1/s"
+    mechanism, match = held_weight(stiffness, damping), rf"{named}.*'slide'.* 1\.0e\+04 1/s"
     with nullcontext() if named is None else pytest.warns(lx.StiffnessWarning, match=match):
         lx.simulate(mechanism, REST, t1=duration, max_steps=4096)
 
@@ -232,13 +232,13 @@ def test_an_element_that_chooses_the_steps_is_named(stiffness, damping, duration
     ],
 )
 def test_of_two_solvers_at_most_one_advises_the_other(damping, advised):
-    mechanism = held(1e8, damping)
+    mechanism = held_weight(1e8, damping)
     for solver, advice in advised.items():
         with nullcontext() if advice is None else pytest.warns(lx.StiffnessWarning, match=advice):
             lx.simulate(mechanism, REST, t1=0.5, solver=solver(), max_steps=4096)
 
 
 def test_a_run_that_an_element_keeps_from_its_end_names_it():
-    mechanism = held(1e12, 0.0)
+    mechanism = held_weight(1e12, 0.0)
     with pytest.raises(lx.SimulationError, match=r"maximum number of solver steps.*JointSpring.* 1\.0e\+06 1/s"):
         lx.simulate(mechanism, REST, t1=2.0, max_steps=4096)

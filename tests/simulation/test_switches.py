@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import pendulum
 
 import linkax as lx
 
@@ -107,14 +108,6 @@ class Friction(lx.AbstractForce):
         return lx.Load.none(motion.system)._replace(joint_force=jnp.where(on, -self.force, self.force)[None])
 
 
-def sliding(friction, start, **options):
-    """A weight on a spring that slides with friction."""
-    weight = lx.point_mass("weight", 1.0)
-    forces = [lx.JointSpring("slide", 100.0), Friction(friction)]
-    mechanism = lx.Mechanism([weight], [lx.Prismatic("slide", lx.GROUND, weight, "x")], forces)
-    return lx.simulate(mechanism, lx.State(start[None], jnp.zeros(1)), t1=1.0, **options)
-
-
 @jax.jit
 def swing(numbers, rtol):
     """Where a weight ends that slides with friction between two ropes, and the derivative along the numbers."""
@@ -184,7 +177,6 @@ def test_switches_that_are_no_number(switch):
         def switch(self, t, motion):
             return switch()
 
-    rod = lx.rod("rod", 1.0, 1.0)
-    mechanism = lx.Mechanism([rod], [lx.Revolute("hinge", lx.GROUND, rod.at("base"), "z")], [Bad(jnp.array(1.0))])
+    mechanism = pendulum(forces=[Bad(jnp.array(1.0))])
     with pytest.raises(ValueError, match="Bad: its switch"):
         lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0)

@@ -29,12 +29,9 @@ def crowned(radius):
 
 
 def free_wheel():
-    """A cone on an arc, its place in the track's frame."""
+    """A wheel that nothing holds, and its system."""
     wheel = lx.RigidBody("wheel", 1000.0, inertia=3 * [100.0])
-    mechanism = lx.Mechanism([wheel], [lx.Free("flight", lx.GROUND, wheel)])
-    cone = lambda y: RADIUS + CONICITY * y
-    pair = WheelRailPair(wheel.reference, lx.GROUND, cone, crowned(0.3), [-0.07, 0.07], "pair")
-    return system_of(mechanism, float), pair
+    return wheel, system_of(lx.Mechanism([wheel], [lx.Free("flight", lx.GROUND, wheel)]), float)
 
 
 def turned(yaw, roll, spin):
@@ -45,7 +42,9 @@ def turned(yaw, roll, spin):
 
 def test_a_cone_touches_an_arc():
     """A plane along the rail that touches the cone holds its apex; the arc is nearest to it below its centre."""
-    system, pair = free_wheel()
+    wheel, system = free_wheel()
+    cone = lambda y: RADIUS + CONICITY * y
+    pair = WheelRailPair(wheel.reference, lx.GROUND, cone, crowned(0.3), [-0.07, 0.07], "pair")
     read = jax.jit(lambda q: (pair.spot(configure(system, 0.0, q)), configure(system, 0.0, q).orientation("wheel")))
     random = np.random.default_rng(0)
     for _ in range(8):
@@ -70,8 +69,7 @@ def flanged(y):
 
 def test_it_touches_the_tread_or_the_flange():
     """The nearest place of all, against a search among many, for a wheel that goes from one side to the other."""
-    wheel = lx.RigidBody("wheel", 1000.0, inertia=3 * [100.0])
-    system = system_of(lx.Mechanism([wheel], [lx.Free("flight", lx.GROUND, wheel)]), float)
+    wheel, system = free_wheel()
     head = lambda y: -1.7 * y**2 - 3e3 * y**4
     pairs = [
         WheelRailPair(wheel.reference, lx.GROUND, flanged, head, span, "pair")
@@ -218,10 +216,7 @@ BAD = {
 }
 RUBS = lx.ContactLaw(1.0, friction=lx.Friction(0.1, transition_speed=1.0))
 ONLY_FORCES = {
-    "friction": (
-        lambda wheel: {"law": lx.ContactLaw(1.0, friction=lx.Friction(0.1, transition_speed=1.0))},
-        "friction",
-    ),
+    "friction": (lambda wheel: {"law": RUBS}, "friction"),
     "law": (lambda wheel: {"law": 1e9}, "give a linkax.ContactLaw"),
     "creep": (lambda wheel: {"creep": 0.3}, "give a linkax.Creep, or None"),
 }

@@ -51,16 +51,8 @@ def _index(rng, pool, size):
 
 
 def _each(rng, pool):
-    functions = (
-        jnp.sin,
-        jnp.cos,
-        jnp.abs,
-        jnp.sign,
-        jnp.negative,
-        lambda x: jnp.sqrt(1.0 + x * x),
-        jnp.exp,
-        jnp.arctan,
-    )
+    root = lambda x: jnp.sqrt(1.0 + x * x)
+    functions = (jnp.sin, jnp.cos, jnp.abs, jnp.sign, jnp.negative, root, jnp.exp, jnp.arctan)
     return functions[rng.integers(len(functions))](_real(rng, pool))
 
 

@@ -296,12 +296,7 @@ def test_straight_lines_over_lanes_within_others():
     x = jnp.array([0.3, -0.7, 1.1, 0.2])
     # Four sines and their sums, but for none of what is zero.
     assert operations(function, x) == (7, 1)
-    everything = lambda function: (
-        function(x),
-        jax.jacfwd(function)(x),
-        jax.grad(function)(x),
-        jax.hessian(function)(x),
-    )
+    everything = lambda function: [function(x), *(of(function)(x) for of in (jax.jacfwd, jax.grad, jax.hessian))]
     assert_same(everything(straight_line(function)), everything(function))
     several = jnp.stack([x, 2.0 * x, -x])
     assert_same(jax.vmap(straight_line(function))(several), jax.vmap(function)(several))

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from mechanisms import pendulum
 from refusals import Shown, refused
 
 import linkax as lx
@@ -78,6 +79,9 @@ PARAMETERS = {
     "Positive": (lx.Positive, [0.0, -1.0, [1.0, -1.0], [1.0, np.nan], *NO_NUMBER]),
     "Bounded": (lambda value: lx.Bounded(value, 0.0, 1.0), [0.0, 1.0, -1.0, 2.0, [0.5, 3.0], *NO_NUMBER]),
     "Bounded: ": (lambda bound: lx.Bounded(0.5, bound, 1.0), [0.5, 2.0, *NO_NUMBER]),
+    "Normal": (lambda deviation: lx.Normal(0.0, deviation), [0.0, -1.0, *NO_NUMBER]),
+    "LogNormal": (lambda median: lx.LogNormal(median, 2.0), [0.0, -1.0, *NO_NUMBER]),
+    "factor": (lambda factor: lx.LogNormal(1.0, factor), [0.5, 1.0, *NO_NUMBER]),
     "PhysicalInertia": (lx.PhysicalInertia, [0.0, -1.0, *NO_NUMBER]),
     "PhysicalInertia: ": (
         lambda inertia: lx.PhysicalInertia(1.0, inertia=inertia),
@@ -94,9 +98,7 @@ def test_bad_parameters_are_named(name):
 
 
 def motion(params):
-    link = lx.rod("link", params["length"], 1.0)
-    mechanism = lx.Mechanism([link], [lx.Revolute("pin", lx.GROUND, link.at("base"), "z")])
-    return lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.ones(1)), t1=1.0)
+    return lx.simulate(pendulum(params["length"]), lx.State(jnp.zeros(1), jnp.ones(1)), t1=1.0)
 
 
 def test_bad_shots_and_derivatives_are_named():
@@ -112,18 +114,16 @@ def test_bad_shots_and_derivatives_are_named():
 
 
 def test_bad_comparisons_are_named():
-    link = lx.rod("link", 1.0, 1.0)
-    mechanism = lx.Mechanism([link], [lx.Revolute("pin", lx.GROUND, link.at("base"), "z")])
     right = {
-        "mechanism": mechanism, "state": lx.State(jnp.zeros(1), jnp.ones(1)), "points": {"tip": ("link", "tip")},
+        "mechanism": pendulum(), "state": lx.State(jnp.zeros(1), jnp.ones(1)), "points": {"tip": ("arm", "tip")},
         "t1": 1.0, "steppings": [lx.Stepping(None, rtol=1e-6)], "formulations": ["tangent-space"],
     }  # fmt: skip
     bad = {
-        "mechanism": [None], "state": [None], "points": [None, {}, {"tip": ("lonk", "tip")}, {"tip": ("link", "top")}],
+        "mechanism": [None], "state": [None], "points": [None, {}, {"tip": ("amr", "tip")}, {"tip": ("arm", "top")}],
         "t1": [-1.0, np.nan, "long"], "steppings": [[], None, [1e-6]], "bound": [0.0, -1.0, np.nan, "far"],
         "formulations": [["magic"], None, []], "repeats": [0, -1, 1.5],
     }  # fmt: skip
     for name, values in bad.items():
         for value in values:
-            word = next((word for word in ("top", "lonk", "magic") if word in repr(value)), name)
+            word = next((word for word in ("top", "amr", "magic") if word in repr(value)), name)
             refused(lambda given=right | {name: value}: lx.compare(**given), word)

@@ -182,12 +182,7 @@ def linear(params, design):
 GOOD = {"predictions": linear, "params": {"a": 1.0, "b": 2.0}, "design": {"x": np.array([0.0, 1.0])}, "progress": False}
 BAD = {
     "predictions": [
-        None,
-        3,
-        "run",
-        lambda p, d: None,
-        lambda p, d: p["a"] * jnp.ones(1),
-        lambda p, d: 1j * linear(p, d),
+        None, 3, "run", lambda p, d: None, lambda p, d: p["a"] * jnp.ones(1), lambda p, d: 1j * linear(p, d),
     ],
     "params": [None, {}, {"a": "one", "b": 1.0}, {"a": np.nan, "b": 1.0}],
     "design": [None, {}, {"x": "far"}, {"x": [0.0, np.inf]}],
@@ -196,7 +191,7 @@ BAD = {
     "of": ["c", ["a", "c"], []],
     "steps": [0, 1.5, True],
     "tolerance": [0.0, -1.0, "fine", np.nan],
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -8,7 +8,6 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
-from mechanisms import pendulum
 
 import linkax as lx
 from linkax.studies.fits import fit_search
@@ -60,15 +59,6 @@ def test_covariance_and_intervals_are_those_of_linear_regression():
     lower, upper = found.interval(0.95)
     np.testing.assert_allclose(upper["slope"] - lower["slope"], 2 * 2.0017 * np.sqrt(covariance[1, 1]), rtol=1e-4)
     np.testing.assert_allclose(found.standard_errors["slope"], np.sqrt(covariance[1, 1]), rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_intervals_hold_the_truth_as_often_as_they_say():
-    held = 0
-    for seed in range(100):
-        lower, upper = lx.fit(apart, {"size": 2.5, "rate": lx.Positive(0.9)}, (measured(seed),)).interval()
-        held += sum(lower[name] < TRUTH[name] < upper[name] for name in TRUTH)
-    assert 180 <= held <= 199  # of 200, at 95 %
 
 
 def test_what_the_data_do_not_determine_is_named():
@@ -206,14 +196,8 @@ def test_loss_by_gradients_of_either_mode():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match="parameter 'a' is 'one'"):
-        lx.fit(lambda p: p["a"], {"a": "one"})
-    with pytest.raises(ValueError, match="parameter 'a' is nan"):
-        lx.fit(lambda p: p["a"], {"a": np.nan})
     with pytest.raises(ValueError, match="not finite at the parameters"):
         lx.fit(lambda p: jnp.log(p["a"] - jnp.arange(3.0)), {"a": 0.0})
-    with pytest.raises(ValueError, match="must be positive"):
-        lx.Positive(-1.0)
     with pytest.raises(ValueError, match="least squares need a residual"):
         lx.fit(lambda p: p["a"] ** 2, {"a": 1.0}, optimiser=optx.LevenbergMarquardt(1e-6, 1e-6))
 
@@ -276,25 +260,3 @@ def test_a_minimum_before_an_edge_is_found(best):
     found = lx.fit(function, {"x": -1.0})
     assert found.ended == "converged"
     np.testing.assert_allclose(found.params["x"], best, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_experiments_with_their_own_initial_states():
-    """A pendulum's length and damping from three swings, the angles at which they began unknown."""
-
-    def angles(params, start):
-        mechanism = pendulum(params["length"], forces=[lx.JointDamper("hinge", params["damping"])])
-        state = lx.State(jnp.reshape(start, 1), jnp.zeros(1))
-        return lx.simulate(mechanism, state, t1=2.0).joint("hinge")
-
-    every = jax.vmap(angles, in_axes=(None, 0))
-    truth = {"length": 0.8, "damping": 0.05, "starts": jnp.array([-1.0, 0.2, 0.5])}
-    exact = np.asarray(every(truth, truth["starts"]))
-    data = exact + 0.01 * np.random.default_rng(0).normal(size=exact.shape)
-    start = {"length": lx.Positive(1.0), "damping": lx.Positive(0.1), "starts": jnp.array([-0.9, 0.1, 0.6])}
-    found = lx.fit(lambda params: every(params, params["starts"]) - data, start)
-    assert found.ended == "converged"
-    assert found.steps <= 15
-    np.testing.assert_allclose(found.noise, 0.01, rtol=0.05)
-    for name, value in truth.items():
-        assert np.all(np.abs(found.params[name] - value) < 4.0 * found.standard_errors[name])

@@ -17,11 +17,9 @@ TIMES = np.linspace(0.0, 4.0, 120)
 @pytest.fixture(scope="module")
 def still():
     """A model whose sensors alone have parameters."""
-    solution = lx.Solution.of_state(pendulum(gravity=0.0), lx.State(np.array([0.3]), np.array([0.5])))
-    parts = {"ts": solution.ts, "q": solution.q, "v": solution.v}
-    end = {"ts": parts["ts"] + 4.0, "q": parts["q"] + 2.0, "v": parts["v"]}
-    joined = {name: jnp.concatenate([parts[name], end[name]]) for name in parts}
-    return dataclasses.replace(solution, **joined)
+    begin = lx.Solution.of_state(pendulum(gravity=0.0), lx.State(np.array([0.3]), np.array([0.5])))
+    ts, q, v = jnp.array([0.0, 4.0]), jnp.array([[0.3], [2.3]]), jnp.array([[0.5], [0.5]])
+    return dataclasses.replace(begin, ts=ts, q=q, v=v)
 
 
 @pytest.fixture(scope="module")

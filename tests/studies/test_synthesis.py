@@ -65,12 +65,6 @@ def test_linkages_are_sorted_and_differ(found):
     assert "transmission angle" in str(found)
 
 
-@pytest.mark.slow
-def test_an_index_beyond_is_told(found):
-    with pytest.raises(ValueError, match=r"index is 99; .* linkages were found"):
-        found.candidate(99)
-
-
 LINE = lambda params: lx.Candidate({"there": params["x"] - 0.3}, {"above": params["x"][0] - 0.5})
 
 
@@ -80,27 +74,22 @@ def test_a_condition_decides_what_a_square_leaves():
     np.testing.assert_allclose(found.params_of(0)["x"], [0.5, 0.3], atol=1e-5)
     np.testing.assert_allclose(found.errors[0], 0.04, rtol=1e-4)
     assert len(found.errors) == 1  # all led there
+    with pytest.raises(ValueError, match=r"index is 99; .* linkages were found"):
+        found.candidate(99)
 
 
-@pytest.mark.parametrize(
-    ("function", "params", "message"),
-    [
-        (LINE, {"x": 1.0}, r"params .* between bounds"),
-        (lambda params: params["x"], {"x": lx.Bounded(0.5, 0.0, 1.0)}, "return linkax.Candidate"),
-        (
-            lambda params: lx.Candidate(params["x"] / 0.0),
-            {"x": lx.Bounded(0.5, 0.0, 1.0)},
-            "finite at none of 20 starts",
-        ),
-        (
-            lambda params: lx.Candidate(params["x"], {}, params["x"]),
-            {"x": lx.Bounded(0.5, 0.0, 1.0)},
-            "what linkax.trace returned",
-        ),
-    ],
-    ids=["bounds", "candidate", "finite", "trace"],
-)
-def test_bad_synthesis(function, params, message):
+FREE = {"x": lx.Bounded(0.5, 0.0, 1.0)}
+BAD = {
+    "bounds": (LINE, {"x": 1.0}, r"params .* between bounds"),
+    "candidate": (lambda params: params["x"], FREE, "return linkax.Candidate"),
+    "finite": (lambda params: lx.Candidate(params["x"] / 0.0), FREE, "finite at none of 20 starts"),
+    "trace": (lambda params: lx.Candidate(params["x"], {}, params["x"]), FREE, "what linkax.trace returned"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_synthesis(case):
+    function, params, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         lx.synthesis(function, params, starts=20, kept=5, progress=False)
 
