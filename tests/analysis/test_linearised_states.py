@@ -7,9 +7,11 @@ import pytest
 from mechanisms import pendulum
 
 import linkax as lx
+from linkax.analysis.linearisation import StateSlopes
 
 AREAS, DEAD, MODULUS, MASS = (2e-3, 1.2e-3), 1e-4, 1.4e9, 500.0
 STIFFNESS = MODULUS * (AREAS[0] ** 2 / (DEAD + AREAS[0] * 0.3) + AREAS[1] ** 2 / (DEAD + AREAS[1] * 0.3))
+FREQUENCY = np.sqrt(STIFFNESS / MASS)
 
 
 def natural_frequency(modulus):
@@ -25,13 +27,28 @@ def natural_frequency(modulus):
 
 
 def test_the_frequency_of_a_load_on_locked_oil():
-    np.testing.assert_allclose(natural_frequency(MODULUS), np.sqrt(STIFFNESS / MASS), rtol=1e-9)
+    np.testing.assert_allclose(natural_frequency(MODULUS), FREQUENCY, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_its_derivative():
     slope = jax.grad(natural_frequency)(MODULUS)
-    np.testing.assert_allclose(slope, np.sqrt(STIFFNESS / MASS) / (2.0 * MODULUS), rtol=1e-7)
+    np.testing.assert_allclose(slope, FREQUENCY / (2.0 * MODULUS), rtol=1e-7)
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_derivative_of_a_frequency_beside_what_nothing_holds(derivative):
+    """Where two pressures push a load, A₁² K₁ + A₂² K₂ = m ω²: place and pressures at rest are a double zero."""
+
+    def frequency(modulus):
+        areas, stiffness = jnp.array(AREAS), jnp.full((1, 1), 1e-30)  # which rounding leaves
+        by_speeds = modulus * jnp.array([[-AREAS[0]], [AREAS[1]]]) / (DEAD + areas[:, None] * 0.3)
+        states = StateSlopes(areas * jnp.array([[1.0, -1.0]]) / MASS, jnp.zeros((2, 1)), by_speeds, jnp.zeros((2, 2)))
+        found = lx.Linearisation(jnp.zeros(1), jnp.eye(1), jnp.eye(1), stiffness, jnp.zeros((1, 1)), states)
+        return jnp.max(found.eigenvalues.imag)
+
+    np.testing.assert_allclose(frequency(MODULUS), FREQUENCY, rtol=1e-12)
+    np.testing.assert_allclose(derivative(frequency)(MODULUS), FREQUENCY / (2.0 * MODULUS), rtol=1e-9)
 
 
 WEIGHT = 3.0 * 9.81 * 0.5  # of a pendulum of 3 kg and 1 m, as a torque
