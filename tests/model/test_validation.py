@@ -153,6 +153,8 @@ BOOM = slender()
 
 
 def test_bad_mechanisms_of_beams():
+    joints = [lx.Fixed("foot", lx.GROUND, BOOM), lx.Revolute("pin", lx.GROUND, body("boom"), "z")]
+    refused(lambda: lx.Mechanism([BOOM, body("boom")], joints), "'boom'", "2 times", "of its own")
     refused(lambda: lx.Mechanism([LINK, BOOM], [PIN]), "connects 'boom' to ground", "join")
     joints = [PIN, lx.Fixed("foot", LINK, BOOM), *(lx.Sliding(name, BOOM, OTHER) for name in ("sleeve", "shoe"))]
     two_sleeves_on_one_body = lambda: lx.Mechanism([LINK, OTHER, BOOM], joints)

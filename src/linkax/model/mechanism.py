@@ -68,6 +68,7 @@ class Mechanism(eqx.Module):
         all_rows: bool = False,
     ) -> None:
         given = _listed(bodies, joints, forces, constraints)
+        _by_name(given[0], "body")  # of beams, too, which are parts with other names from here on
         parts = discretise_beams(*given)
         body_by_name = _check_names(parts)
         tree = _spanning_tree(list(body_by_name), parts)
