@@ -245,8 +245,9 @@ def test_the_default_folder_is_the_users(tmp_path, monkeypatch):
     assert program_cache.users_folder() == Path.home() / ".cache" / "linkax"
 
 
-def test_what_cannot_be_kept_is_told():
-    program_cache._warn.cache_clear()
+def test_what_cannot_be_kept_is_told(monkeypatch, tmp_path):
+    monkeypatch.setattr(program_cache, "_warn", program_cache._warn.__wrapped__)  # not once only
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     program_cache._note(program_cache.ASKED)
     with pytest.warns(UserWarning, match="keeps none that calls back to Python") as told:
         program_cache._tell(program_cache.COMPILING, 3.0)
@@ -255,6 +256,9 @@ def test_what_cannot_be_kept_is_told():
         program_cache._note(program_cache.ASKED)
         program_cache._note(event)
         program_cache._tell(program_cache.COMPILING, 3.0)
+    jax.config.update("jax_compilation_cache_dir", None)
+    program_cache._note(program_cache.ASKED)
+    program_cache._tell(program_cache.COMPILING, 3.0)
 
 
 def test_warnings_point_to_the_users_line():

@@ -71,7 +71,8 @@ def _listen():
 def _note(event: str, **_what: Any) -> None:
     """Note whether the program that this thread compiles is missing in the cache."""
     if event == ASKED:
-        _thread.missing = True
+        # JAX asks where it has no folder, too, as in a process that keeps programs no longer.
+        _thread.missing = cast(Any, jax.config).jax_compilation_cache_dir is not None
     elif event in FOUND_OR_KEPT:
         _thread.missing = False
 
