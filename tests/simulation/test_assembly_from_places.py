@@ -125,6 +125,20 @@ def test_rough_places_lead_to_the_mode_drawn(name, count):
     assert row["drawn"] >= 0.98
 
 
+def test_a_pose_may_be_known_where_the_mechanism_is_traced():
+    """Of a rod in the air, whose coordinates it is."""
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+    @jax.jit
+    def assembled(length):
+        rod = lx.rod("rod", length, 1.0)
+        mechanism = lx.Mechanism([rod], [lx.Free("flight", lx.GROUND, rod)])
+        return lx.assemble(mechanism, guess={"rod": lx.Pose([1.0, 2.0, 3.0], turned)}).q
+
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(assembled(2.0), [half, 0.0, 0.0, half, 1.0, 2.0, 3.0], atol=1e-12)
+
+
 def test_assemblies_are_counted_as_textbooks_do():
     """Of Jansen's leg, which is three dyads with two modes each."""
     leg = hidden(LINKAGES["Jansen leg"]())

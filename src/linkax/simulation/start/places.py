@@ -21,7 +21,7 @@ from linkax.model.poses import Pose, Velocity
 from linkax.model.terms import Term
 from linkax.spatial.quaternions import from_rotation_matrix
 from linkax.xla.arrays import Array
-from linkax.xla.tracing import concrete
+from linkax.xla.tracing import concrete, evaluate_now
 
 SUFFIX = " in the world"  # of the name of a joint that measures
 TURNS, MOVES = (0, 1, 2), (3, 4, 5)  # indices of the speeds of a `Free`
@@ -151,7 +151,7 @@ def quaternion_of(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """Quaternion of a rotation matrix, of NumPy where it is known."""
     if concrete(rotation) is None:
         return from_rotation_matrix(rotation)
-    return np.asarray(_quaternion(rotation))
+    return np.asarray(evaluate_now(_quaternion, rotation))
 
 
 _quaternion = jax.jit(from_rotation_matrix)
