@@ -17,7 +17,8 @@ def scenes(*quick):
 
 
 STEP = 6e-5  # relative; with 3e-4 differences of the strandbeest's speeds are 2e-4 off, with 1.5e-4 1e-5
-FEWER = {"n-four-bar": {"N": 2}, "telescopic-crane": {"elements": 1}}  # parts of the same kinds
+# Parts of the same kinds.
+FEWER = {"n-four-bar": {"N": 2}, "telescopic-crane": {"elements": 1}, "hoberman": {"pairs": 3, "angle": 1.26}}
 
 
 class Numbers:
