@@ -18,25 +18,29 @@ _eig = one_by_one(lambda matrix: tuple(jnp.linalg.eig(matrix)))
 
 @jax.custom_jvp
 def _spectrum(matrix):
-    """Eigenvalues and eigenvectors of a matrix, differentiable to any order, each beside others that are equal."""
+    """Eigenvalues and eigenvectors of a matrix, differentiable to any order where no two are equal.
+
+    The first derivative of an eigenvalue asks only that no other equals it.
+    """
     return _eig(matrix)
 
 
 @_spectrum.defjvp
 def _spectrum_jvp(primals, tangents):
-    """By left eigenvectors w: λ̇ = wᵀ Ȧ v / wᵀ v.
+    """Of an eigenvalue by its left eigenvector w: λ̇ = wᵀ Ȧ v / wᵀ v.
 
-    The inverse of all eigenvectors has them too, but none where two others are parallel, as those of a double zero are.
+    The inverse of all eigenvectors has w too, but is none where two others are parallel, as those of a double zero are.
     """
     (matrix,), (change,) = primals, tangents
     values, vectors = _spectrum(matrix)
     left_values, left = _spectrum(matrix.T)
     left = left[:, jnp.argmin(jnp.abs(values[:, None] - left_values[None, :]), axis=1)]
-    along = jnp.sum(left * vectors, axis=0)
-    rotated = left.T @ change.astype(vectors.dtype) @ vectors / along[:, None]
+    moved = change.astype(vectors.dtype) @ vectors
+    slopes = jnp.sum(left * moved, axis=0) / jnp.sum(left * vectors, axis=0)
+    rotated = jnp.linalg.solve(vectors, moved)
     apart = values[None, :] - values[:, None] + jnp.eye(len(values), dtype=values.dtype)
     mixed = jnp.where(jnp.eye(len(values), dtype=bool), 0.0, rotated / apart)
-    return (values, vectors), (jnp.diagonal(rotated), vectors @ mixed)
+    return (values, vectors), (slopes, vectors @ mixed)
 
 
 def _table(found: "Linearisation") -> Table:
