@@ -78,3 +78,8 @@ def test_saved_times_that_show_no_passage_are_refused():
     end = lambda params: crank_slider(params, saveat=diffrax.SaveAt(t1=True))
     with pytest.raises(ValueError, match="save more times"):
         lx.differentiability(end, NUMBERS)
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match=r"must return a linkax\.Solution"):
+        lx.differentiability(lambda params: jnp.zeros(3), NUMBERS)

@@ -158,3 +158,10 @@ def test_a_prior_is_a_part_of_the_likelihood():
     lower, upper = lx.profile(residual, found, "free", (measured,)).interval(0.95)
     wide = 0.3 * student.ppf(0.975, 19)
     np.testing.assert_allclose([lower, upper], [1.0 - wide, 1.0 + wide], rtol=1e-3)
+
+
+def test_what_cannot_be_profiled():
+    residual = lambda params: params["x"] - jnp.array([1.0, 1.1, 0.9])
+    found = lx.fit(residual, {"x": 0.5}, progress=False)
+    with pytest.raises(ValueError, match=r"some come twice"):
+        lx.profile(residual, found, "x", values=[0.9, 1.1, 1.1])

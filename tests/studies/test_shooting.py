@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import linkax as lx
 
@@ -49,3 +50,11 @@ def test_gaps_and_outputs_are_those_of_the_pieces():
     second = oscillation(FREQUENCY, starts[1], TIMES[150:], 30.0)[1]
     np.testing.assert_allclose(shots.outputs, np.concatenate([first, second]), atol=1e-12)
     np.testing.assert_allclose(shots.gaps, [end - starts[1]], atol=1e-12)
+
+
+def test_bad_input():
+    run = lambda *motion: oscillation(FREQUENCY, *motion)
+    with pytest.raises(ValueError, match="7 starts for times of shape"):
+        lx.shoot(run, jnp.zeros((7, 2)), TIMES)
+    with pytest.raises(ValueError, match="same first axis"):
+        lx.shoot(run, (jnp.zeros((2, 2)), jnp.zeros(3)), TIMES)

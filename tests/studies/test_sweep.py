@@ -121,3 +121,12 @@ def test_chunks_shrink_to_the_memory():
     assert found.output.shape == (20,)
     assert found.ok.all()
     assert len(sizes) > 2  # compiled again, smaller
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="same leading axis"):
+        lx.sweep(lambda p: p["a"], {"a": jnp.zeros(3), "b": jnp.zeros(4)})
+    with pytest.raises(ValueError, match="one number for each of 3"):
+        lx.sweep(jnp.sin, jnp.zeros(3), difficulty=np.zeros(2))
+    with pytest.raises(ValueError, match="chunk is 0"):
+        lx.sweep(jnp.sin, jnp.zeros(3), chunk=0)
