@@ -41,13 +41,14 @@ def ran(folder, *options):
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True).stdout
 
 
-def test_a_fast_test_that_takes_long_is_an_error(tmp_path):
+def test_a_test_that_takes_long_is_an_error(tmp_path):
     told = ran(tmp_path)
     assert "3 passed, 1 error" in told
     assert "ERROR test_them.py::test_busy" in told
-    assert "s of processor time, and a test may take 0.2: share" in told
+    assert "s of processor time, and may take 0.2: share" in told
     assert "s in 3 tests; the longest:" in told
     assert "did not run" not in told
+    assert "may take 0.3: make tests of its parts" in ran(tmp_path, "-o", "most_processor_time=0.01")
 
 
 def test_what_did_not_run_is_told(tmp_path):
