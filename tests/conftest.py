@@ -27,6 +27,7 @@ if not AS_USERS_DO:
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 import jax  # noqa: E402
+import psutil  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import Phase, settings  # noqa: E402
 from jax.experimental.compilation_cache import compilation_cache  # noqa: E402
@@ -98,28 +99,33 @@ def pytest_collection_modifyitems(items):
 # Compiled programs hold memory maps, of which Linux gives a process 65 530 unless it is told otherwise. Programs of the
 # largest file of tests take fewer than these.
 MAPS_OF_A_FILE = 15_000
-MEMORY_OF_A_FILE = 3e9  # [bytes]; even the smallest program takes 1.4 MB
 
 
-def _memory_left():
-    """What the machine can still give [bytes], infinite where it does not tell."""
-    try:
-        return 1024.0 * int(re.search(r"MemAvailable: +(\d+) kB", Path("/proc/meminfo").read_text())[1])
-    except OSError:
-        return float("inf")
+def _forget_programs():
+    gc.unfreeze()
+    memory_maps.clear_caches()
+    if sys.platform == "linux":
+        ctypes.CDLL(None).malloc_trim(0)  # the C library keeps what is freed
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup():
+    """Forget programs where this process holds more memory than the machine can still give.
+
+    Even the smallest program takes 1.4 MB, and what is traced for one number of the Delta robot alone 100 MB.
+    """
+    if psutil.Process().memory_info().rss > psutil.virtual_memory().available:
+        _forget_programs()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _room_for_compiled_programs():
-    """Forget programs before a file of tests that the machine may have no memory for, or no maps.
+    """Forget programs before a file of tests that there may be no memory maps for.
 
-    Where maps run out in the middle of a file, linkax forgets programs with a warning.
+    Where these run out in the middle of a file, linkax forgets programs with a warning.
     """
-    if not memory_maps.has_room(MAPS_OF_A_FILE) or _memory_left() < MEMORY_OF_A_FILE:
-        gc.unfreeze()
-        memory_maps.clear_caches()
-        if sys.platform == "linux":
-            ctypes.CDLL(None).malloc_trim(0)  # the C library keeps what is freed
+    if not memory_maps.has_room(MAPS_OF_A_FILE):
+        _forget_programs()
     yield
     # What a file leaves is mostly programs in caches. To look through those of all files for garbage takes 7 s a time.
     gc.collect(1)
