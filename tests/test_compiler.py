@@ -29,19 +29,11 @@ def _as_users_do(name):
     return json.loads(done.stdout)
 
 
-@pytest.fixture(scope="module")
-def as_users_do():
-    return _as_users_do("compiled_as_users_do.py")
-
-
 @pytest.mark.slow
-def test_importing_linkax_is_enough_for_kernels(as_users_do):
-    assert as_users_do["makes_kernels"]
-
-
-@pytest.mark.slow
-def test_how_a_run_is_compiled_changes_nothing_but_rounding(as_users_do):
-    one, other = as_users_do["motion"], motion()
+def test_importing_linkax_is_enough_for_kernels_which_change_nothing_but_rounding():
+    found = _as_users_do("compiled_as_users_do.py")
+    assert found["makes_kernels"]
+    one, other = found["motion"], motion()
     assert one["steps"] == other["steps"]
     np.testing.assert_allclose(one["speeds"], other["speeds"], rtol=1e-10)
 
