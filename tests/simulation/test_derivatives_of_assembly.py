@@ -19,7 +19,7 @@ def scenes(*quick):
 STEP = 6e-5  # relative; with 3e-4 differences of the strandbeest's speeds are 2e-4 off, with 1.5e-4 1e-5
 # Parts of the same kinds.
 FEWER = {"n-four-bar": {"N": 2}, "telescopic-crane": {"elements": 1}, "hoberman": {"pairs": 3, "angle": 1.26}}
-PARTS = 6  # of a scene's numbers, each one test: the Delta robot's 106 take 800 s
+PARTS = 12  # of the numbers of a scene, each one test: the 106 of the Delta robot take 800 s
 
 
 class Numbers:
