@@ -32,9 +32,9 @@ def test_quick():
 
 
 def ran(folder, *options):
-    """What pytest prints of `BUSY` with the rules of these tests, where a test may take 0.2 s."""
+    """What pytest prints of `BUSY` with the rules of these tests, where a test may take 0.05 s."""
     (folder / "test_them.py").write_text(BUSY)
-    (folder / "pytest.ini").write_text("[pytest]\nmost_processor_time = 0.2\nmarkers = slow")
+    (folder / "pytest.ini").write_text("[pytest]\nmost_processor_time = 0.05\nmarkers = slow")
     plugins = ["-p", "xdist", "-p", "processor_time", "-p", "slow_tests"]
     command = [sys.executable, "-m", "pytest", *plugins, "-n1", "-ra", *options]
     environment = os.environ | {"PYTHONPATH": str(TESTS), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
@@ -45,10 +45,10 @@ def test_a_test_that_takes_long_is_an_error(tmp_path):
     told = ran(tmp_path)
     assert "3 passed, 1 error" in told
     assert "ERROR test_them.py::test_busy" in told
-    assert "s of processor time, and may take 0.2: share" in told
+    assert "s of processor time, and may take 0.05: share" in told
     assert "s in 3 tests; the longest:" in told
     assert "did not run" not in told
-    assert "may take 0.3: make tests of its parts" in ran(tmp_path, "-o", "most_processor_time=0.01")
+    assert "may take 0.03: make tests of its parts" in ran(tmp_path, "-o", "most_processor_time=0.001")
 
 
 def test_what_did_not_run_is_told(tmp_path):
