@@ -16,8 +16,8 @@ from mechanisms import pendulum
 import linkax as lx
 from linkax.xla import memory_maps
 
-UNLIKE, REBUILT = 60, 500
-HELD = 48_000  # memory maps, so that those left are used up several times
+UNLIKE, REBUILT = 40, 500
+HELD = 51_000  # memory maps, so that those left are used up several times
 KINDS = (lx.Revolute, lx.Prismatic, lx.Universal, lx.Cylindrical, lx.Planar)
 
 
