@@ -110,10 +110,7 @@ def _forget_programs():
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup():
-    """Forget programs where this process holds more memory than the machine can still give.
-
-    Even the smallest program takes 1.4 MB, and what is traced for one number of the Delta robot alone 100 MB.
-    """
+    """Forget programs where this process holds more memory than the machine has left: the smallest takes 1.4 MB."""
     if psutil.Process().memory_info().rss > psutil.virtual_memory().available:
         _forget_programs()
 

@@ -20,12 +20,14 @@ from linkax.xla.memory_maps import ROOM
 from linkax.xla.program import Program
 
 
-def _as_users_do(name):
+def _as_users_do(name, *options):
     """What a program of this folder prints, without the flags of the tests."""
     of_tests = ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR")
     environment = {name: text for name, text in os.environ.items() if name not in of_tests}
     program = Path(__file__).with_name(name)
-    done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, program, *options], env=environment, capture_output=True, text=True, check=True
+    )
     return json.loads(done.stdout)
 
 
@@ -148,10 +150,15 @@ def test_systems_that_tell_no_limit_are_left_alone(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_many_mechanisms_in_one_process():
-    done = _as_users_do("many_programs.py")
-    assert done["unlike"] == 40
+def test_many_unlike_mechanisms_in_one_process():
+    done = _as_users_do("many_programs.py", "unlike")
+    assert done["unlike"] == 60
     assert done["cleared"] > 1
     assert done["ends"][0] == done["ends"][1]
+
+
+@pytest.mark.slow
+def test_many_rebuilt_mechanisms_in_one_process():
+    done = _as_users_do("many_programs.py", "rebuilt")
     assert done["error"] < 1e-7
     assert 0 < done["programs"] < 50
