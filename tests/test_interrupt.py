@@ -158,17 +158,17 @@ PART = {"trajectory-interrupted.npz", "summary-interrupted.json"}
 @pytest.mark.parametrize(
     ("command", "after", "wait", "left"),
     [
-        (PENDULUM, "", 2.0, set()),
+        (PENDULUM, "assembling", 0.3, set()),
         (PENDULUM, "assembling", 0.0, set()),
-        (PENDULUM, "compiling", 0.5, set()),
+        (PENDULUM, "compiling", 0.3, set()),
         (["simulate", "n-four-bar", "--set", "N=6"], "compiling", 1.0, set()),  # which compiles for seconds anywhere
         (LONG, "integrating", 0.0, set()),
         (LONG, "integrating", 2.0, PART),  # some of its twenty segments are there
-        (PENDULUM, "reading", 0.3, PART),
+        (PENDULUM, "reading", 0.2, PART),
         (PENDULUM, "drawing", 0.0, {"trajectory.npz", "summary.json"}),
         (PENDULUM, "drawing", "motion_bob.png", {"trajectory.npz", "summary.json"}),
         (PENDULUM, "drawing", "reaction_pivot.png", {"trajectory.npz", "summary.json"}),  # the last before the GIF
-        (COMPARED, "compiling", 1.0, set()),
+        (COMPARED, "compiling", 0.5, set()),
     ],
 )
 def test_ctrl_c_at_each_moment_of_a_command(command, after, wait, left, tmp_path):
