@@ -11,7 +11,7 @@ from mechanisms import crank_slider, pendulum
 
 import linkax as lx
 
-EVERY = (6, 3)  # of the saved states: what is left of them
+EVERY = (8, 4)  # of the saved states: what is left of them
 
 
 def thinned(solution, every):
@@ -24,7 +24,7 @@ def loop():
     """A loop with a cut joint."""
     mechanism = crank_slider(cut="wrist_pin")
     state = lx.assemble(mechanism, {"bearing": 0.4}, {"bearing": 3.0})
-    saveat = diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 121))
+    saveat = diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 241))
     return lx.simulate(mechanism, state, t1=1.0, accuracy=lx.Accuracy(1e-11), saveat=saveat)
 
 
@@ -39,7 +39,7 @@ def top():
     body = lx.RigidBody("top", 1.0, [0.0, 0.0, 0.3], inertia=[0.1, 0.12, 0.05])
     mechanism = lx.Mechanism([body], [lx.Spherical("ball", lx.GROUND, body)], [lx.Gravity([0.0, 0.0, -9.81])])
     state = lx.State(jnp.eye(4)[0], jnp.array([2.0, 1.0, 5.0]))
-    saveat = diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 121))
+    saveat = diffrax.SaveAt(ts=np.linspace(0.0, 1.0, 241))
     return lx.simulate(mechanism, state, t1=1.0, accuracy=lx.Accuracy(1e-11), saveat=saveat)
 
 

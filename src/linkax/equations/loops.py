@@ -34,6 +34,7 @@ from linkax.equations.loop_rows import (
 )
 from linkax.equations.motion import Motion
 from linkax.linalg.static_sparse import StaticSparse
+from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import jit_inline
 
@@ -47,6 +48,11 @@ def residual(configuration: Configuration) -> Float[Array, " m"]:
     if system.constraints:
         rows.append(constraint_residual(configuration))
     return jnp.concatenate(rows)
+
+
+def widest(configuration: Configuration) -> Float[Array, ""]:
+    """The largest |c|, in radians and lengths of the mechanism or the loop."""
+    return largest(residual(configuration))
 
 
 def immobile_residual(configuration: Configuration) -> Float[Array, " m_immobile"]:

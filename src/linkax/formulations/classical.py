@@ -112,6 +112,11 @@ class ClassicalFormulation(AbstractFormulation):
     def moves_after_steps(self) -> bool:
         return self.correction is not None
 
+    @property
+    def closes_loops(self) -> bool:
+        """No: without a correction states are left as they are, and with one they get a fixed number of sweeps."""
+        return False
+
     def _solved(self, at: LinearSystem, v) -> Dynamics:
         """Solve for v̇ and λ, and for what v̇ violates of the rows without stabilisation."""
         system, motion = at.configuration.system, move(at.configuration, v)

@@ -4,16 +4,23 @@ import abc
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import Configuration, configure
+from linkax.equations.coordinates import speeds
 from linkax.equations.dynamics import mass_entries
-from linkax.equations.loops import jacobian_entries
+from linkax.equations.loops import jacobian_entries, widest
 from linkax.equations.system import System
 from linkax.linalg.block_elimination import Blocks, in_fronts
+from linkax.model.topology import Topology
+from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import jit_inline
+
+NEAR = 0.1  # radians, or lengths of the mechanism: how far a state may be corrected, and is on the same branch
 
 
 class LinearSystem(NamedTuple):
@@ -70,6 +77,11 @@ class AbstractFormulation(eqx.Module):
     def moves_after_steps(self) -> bool:
         """Whether `correct` moves a state to where its derivative is another one."""
 
+    @property
+    @abc.abstractmethod
+    def closes_loops(self) -> bool:
+        """Whether `close` puts states on the loops, to rounding."""
+
     @abc.abstractmethod
     def derivative(
         self,
@@ -103,6 +115,25 @@ class AbstractFormulation(eqx.Module):
     ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"]]:
         """Compute q and v as they are saved and read."""
 
+    def checks_loops(self, topology: Topology) -> bool:
+        """Whether there are loops, and `close` puts states on them."""
+        return self.closes_loops and topology.num_rows > 0
+
+    def close_near(
+        self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+    ) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], Bool[Array, ""] | bool]:
+        """`close`, and whether the loops are closed then, on the branch that q was next to."""
+        closed, v = self.close(system, t, q, v)
+        return closed, v, not self.checks_loops(system.topology) or lax.stop_gradient(_is_near(system, t, q, closed))
+
     @abc.abstractmethod
     def dynamics(self, system: System, t: ScalarLike, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Dynamics:
         """Compute accelerations and multipliers at a saved state."""
+
+
+@jit_inline
+@straight_line
+def _is_near(system, t, before, closed):
+    """Whether coordinates close the loops, and are near those before."""
+    moved = system.fastest(speeds(system.topology, closed, closed - before))
+    return (widest(configure(system, t, closed)) <= jnp.sqrt(jnp.finfo(closed.dtype).eps)) & (moved <= NEAR)

@@ -17,7 +17,7 @@ from linkax.equations.configuration import configure
 from linkax.equations.constraint_rows import is_driven
 from linkax.equations.coordinates import on_manifold, retract
 from linkax.equations.dynamics import generalised_force
-from linkax.equations.loops import gamma, residual
+from linkax.equations.loops import gamma, widest
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import linear_system
@@ -146,7 +146,7 @@ def _improved(arguments, before, small):
     method, system, t, q, v = arguments
     linear = linear_system(system, t, q)
     split = method.split(linear)
-    gap = largest(residual(linear.configuration))
+    gap = widest(linear.configuration)
     done = (gap <= small) | (gap >= before)
     q = jnp.where(done, q, method.correct_position(linear, split, linear.configuration))
     return (q, method.correct_velocity(linear, split, v, refinements=1), split.distance), gap
@@ -260,7 +260,7 @@ def _closed_at(arguments, t, q) -> Value:
 
 
 def _gap(system, t, q):
-    return largest(residual(configure(system, t, q)))
+    return widest(configure(system, t, q))
 
 
 def _inertia(system):

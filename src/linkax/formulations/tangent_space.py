@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from linkax.equations.configuration import Configuration
 from linkax.equations.coordinates import on_manifold, retract
 from linkax.equations.dynamics import generalised_force
-from linkax.equations.loops import gamma, rate, residual
+from linkax.equations.loops import gamma, rate, residual, widest
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations import projected_state
@@ -34,7 +34,6 @@ from linkax.linalg.block_elimination import (
 from linkax.linalg.constrained_solve import SaddlePoint, constrained_solve
 from linkax.linalg.saddle_inverse import SaddleInverse, invert_apart, singularity_distance, with_mass
 from linkax.model.numbers import Number, number, one_of, require, whole_number
-from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import jit_inline
 
@@ -105,6 +104,11 @@ class TangentSpace(AbstractFormulation):
     def moves_after_steps(self) -> bool:
         """No: derivatives are those of the corrected state."""
         return False
+
+    @property
+    def closes_loops(self) -> bool:
+        """Yes: with fresh factors, by Newton's method."""
+        return True
 
     def split(self, linear: LinearSystem) -> Factors:
         """Factorise A P = Q R, front by front where that takes less."""
@@ -260,7 +264,7 @@ class TangentSpace(AbstractFormulation):
             in_q, in_v = jax.vmap(lambda error: self.tangential_part(linear, split, error))(jnp.stack(errors))
             if np.any(system.topology.slips):  # along which no correction of places takes errors out
                 in_q = errors[0]
-            open_ = largest(residual(linear.configuration)) * system.scales
+            open_ = widest(linear.configuration) * system.scales
             errors = jnp.where(jnp.abs(in_q) < open_, open_, in_q), in_v
         return q, v, errors, split.distance
 

@@ -15,12 +15,20 @@ from linkax.xla.derivatives import materialise
 from linkax.xla.primitives import primitive
 
 
+def infinite_where(missing: Bool[Array, "*rows"], values: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
+    """Infinity in rows of `values` that are missing, with undefined derivatives by `inputs`, see `undefined_where`."""
+    across = lambda value: missing.reshape(missing.shape + (1,) * (value.ndim - missing.ndim))
+    undefined = jax.tree.map(across, values)
+    masked = jax.tree.map(lambda none, value: jnp.where(none, jnp.inf, value), undefined, values)
+    return undefined_where(undefined, masked, inputs)
+
+
 @eqx.filter_custom_jvp
 def undefined_where(undefined: PyTree[Bool[Array, "..."]], values: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
     """Return `values` as they are, with undefined derivatives by `inputs` where `undefined`.
 
     Forwards these are NaN. Backwards so are the cotangents of all inputs, unless the value has no cotangent: what a
-    loss leaves out, such as failed members of a batch, spoils nothing.
+    loss leaves out, such as failed members of a batch, spoils nothing. A cotangent that is NaN goes to all inputs, too.
 
     **Arguments:** `values`: pytree of arrays; `undefined`: of booleans that broadcast to them; `inputs`: what the
     values were computed from.
@@ -54,9 +62,10 @@ def _jvp(primals, tangents):
 
 def _transpose(arguments, cotangent):
     undefined, _ = arguments
-    spoilt = undefined & (cotangent != 0.0)
+    spoilt = undefined & (cotangent != 0.0) | jnp.isnan(cotangent)
     of_inputs = jnp.where(jnp.any(spoilt), jnp.nan, 0.0).astype(cotangent.dtype)
-    return None, jnp.append(jnp.where(spoilt, jnp.nan, cotangent), of_inputs)
+    # What computed the values sees none: linear solvers inside of it stop the whole program at one.
+    return None, jnp.append(jnp.where(spoilt, 0.0, cotangent), of_inputs)
 
 
 _spoiled = primitive("undefined_where", _spoil, _abstract, _jvp, _transpose)

@@ -36,6 +36,8 @@ class StepError(NamedTuple):
     - `leaves`: distance d from the nearest singular configuration where the step begins.
     - `passes`: the smallest d of its other stages. `retry`: by how much to change the step so that
       what passes there falls between two stages.
+    - `opens`: the largest gap of the loops on the way, where states between steps are read before they are corrected
+      [rad, lengths of the mechanism]; None without loops.
     - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
       past, one for none; None where there are none.
     """
@@ -44,6 +46,7 @@ class StepError(NamedTuple):
     leaves: Float[Array, ""]
     passes: Float[Array, ""]
     retry: Float[Array, ""]
+    opens: Float[Array, ""] | None = None
     switch: Float[Array, ""] | None = None
 
 

@@ -22,7 +22,7 @@ from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.options import saved_times
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.projected_solver import ProjectedSolver
-from linkax.simulation.integrate.results import ENDED_WELL, RESULTS
+from linkax.simulation.integrate.results import RESULTS, ended_well
 from linkax.simulation.integrate.run import SAVE_STATE, Run, cast, saves_states
 from linkax.simulation.integrate.step_derivatives import InitialValueProblem
 from linkax.simulation.integrate.switches import start_sides
@@ -33,7 +33,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.flat import Flat
 from linkax.xla.program import Program, runs_often
 from linkax.xla.tracing import all_concrete, concrete, is_first
-from linkax.xla.undefined import undefined_where
+from linkax.xla.undefined import infinite_where, undefined_where
 from linkax.xla.waiting import compiling
 
 
@@ -61,13 +61,15 @@ def integrate_run(run: Run) -> Outcome:
     if concrete(sound := sound_numbers(run.mechanism)) is None:
         initial = initial.of_numbers(sound)
     integrated = _integrate(run, initial)
-    return Outcome(initial, integrated, *_closed(*_closing(run, initial, integrated)))
+    reached, end, saved = _closed(*_closing(run, initial, integrated))
+    return Outcome(initial, integrated._replace(**reached._asdict()), end, saved)
 
 
 def _closing(run, initial, integrated):
     """The arguments of `_closed`."""
     saveat: Any = run.options.saveat
-    given = (integrated.ts, integrated.t_end), (integrated.ys, integrated.y_end), saves_states(saveat), _firsts(run)
+    reached = Reached(integrated.ts, integrated.t_end, integrated.result)
+    given = reached, (integrated.ys, integrated.y_end), saves_states(saveat), _firsts(run)
     return run.flat, run.formulation, run.accuracy, initial, *given
 
 
@@ -141,7 +143,8 @@ class _OnManifold(eqx.Module):
 
     # diffrax passes `args` by name where it seeks the root of an event.
     def __call__(self, t: Float[Array, ""], y: Float[Array, " n"], args: Problem, **unused: Any) -> Any:
-        return self.function(t, args.close(t, y), args.mechanism)
+        state, holds = args.close(t, y)
+        return self.function(t, infinite_where(jnp.logical_not(holds), state, y), args.mechanism)
 
 
 def _wrapped_saves(subs):
@@ -178,7 +181,7 @@ def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptiv
 
 def _without_derivatives(integrated: Integrated, event, inputs) -> Integrated:
     """The same without derivatives where the run failed, or ended with a step that an event ended."""
-    failed = jnp.logical_not(jnp.stack([integrated.result == getattr(RESULTS, name) for name in ENDED_WELL]).any())
+    failed = jnp.logical_not(ended_well(integrated.result))
     at_end = failed
     if event is not None and event.root_finder is None:
         at_end = failed | (integrated.result == RESULTS.event_occurred)
@@ -204,18 +207,47 @@ def _firsts(run):
     return None if ts is None else np.searchsorted(ts, ts)
 
 
+class Reached(NamedTuple):
+    """Times that a run saved and ended at, and how it ended."""
+
+    ts: Any
+    t_end: Float[Array, ""]
+    result: Any
+
+
 @runs_often
-def _closed(flat, formulation, accuracy, initial, times, values, saves, firsts) -> tuple[State, State | None]:
-    """The state at the end, and those that are saved, on the loops; infinite where none was saved."""
+def _closed(
+    flat, formulation, accuracy, initial, reached, values, saves, firsts
+) -> tuple[Reached, State, State | None]:
+    """What was reached, the state at the end, and those that are saved, on the loops; infinite where none was saved.
+
+    The run fails where a state does not close nearby: what comes later is not given out.
+    """
     problem = problem_of(flat, formulation, accuracy, initial)
-    (ts, t_end), (ys, y_end) = times, values
+    ts, t_end, _ = reached
+    ys, y_end = values
     if not saves:
-        return problem.close(t_end, y_end), None
+        end, holds = problem.close(t_end, y_end)
+        return *_checked(reached, end, jnp.asarray(holds), t_end), None
     # The end comes first, so that it is in the same part as times that were saved.
     saved = jnp.isfinite(ts)
     once = saved if firsts is None else saved & (firsts == jnp.arange(len(ts)))
     rows = [jnp.concatenate(parts) for parts in ((jnp.ones(1, bool), once), (t_end[None], ts), (y_end[None], ys))]
-    closed = map_saved_times(problem.close, *rows)
+    closed, holds = map_saved_times(problem.close, *rows)
     each = lambda rows: rows[1:] if firsts is None else rows[1:][firsts]
-    later = lambda rows: jnp.where(saved[:, None], each(rows), jnp.inf)
-    return jax.tree.map(lambda rows: rows[0], closed), jax.tree.map(later, closed)
+    holds_later = each(holds) | jnp.logical_not(saved)
+    fails_at = jnp.min(jnp.where(holds_later, t_end, ts), initial=jnp.inf)
+    reached, end = _checked(
+        reached, jax.tree.map(lambda rows: rows[0], closed), holds[0] & jnp.all(holds_later), fails_at
+    )
+    missing = jnp.logical_not(saved & (jnp.cumsum(~holds_later) == 0))
+    reached = reached._replace(ts=jnp.where(missing, jnp.inf, ts))
+    return reached, end, infinite_where(missing, jax.tree.map(each, closed), values)
+
+
+def _checked(reached, end, holds, fails_at):
+    """What was reached, and the state at its end: where a state does not hold, a run that ended well fails there."""
+    fails = jnp.logical_not(holds) & ended_well(reached.result)
+    result = RESULTS.where(fails, RESULTS.off_loops, reached.result)
+    t_end = jnp.where(fails, fails_at, reached.t_end)
+    return reached._replace(t_end=t_end, result=result), infinite_where(fails, end, end)

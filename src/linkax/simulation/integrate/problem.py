@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from linkax.equations.configuration import configure
-from linkax.equations.coordinates import rates, speeds
+from linkax.equations.coordinates import on_manifold, rates, speeds
 from linkax.equations.internal_states import bound, internal_rates, num_states
+from linkax.equations.loops import widest
 from linkax.equations.motion import move
 from linkax.equations.system import System
 from linkax.formulations.formulation import AbstractFormulation
@@ -127,10 +128,17 @@ class Problem(eqx.Module):
         errors = None if error is None else (*of_motion, *of_internal)
         return pack(self.sides(y), q, v, self.internal(y), integral_of_distance(y)), errors, distance
 
-    def close(self, t: Float[Array, ""], y: Float[Array, " n"]) -> State:
-        """The `State` on the manifold to rounding."""
-        q, v = self.method.close(self.system, t, *self.unpacked(y))
-        return State(q, v, self.system.topology, self.internal(y))
+    @jit_inline
+    @straight_line
+    def opens(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, ""]:
+        """The largest gap of the loops at a vector [rad, lengths of the mechanism]."""
+        q = on_manifold(self.system.topology, self.unpacked(y)[0])
+        return widest(configure(self.system, t, q))
+
+    def close(self, t: Float[Array, ""], y: Float[Array, " n"]) -> tuple[State, Bool[Array, ""] | bool]:
+        """The `State` on the manifold to rounding, and whether it is there, on the branch that y is next to."""
+        q, v, holds = self.method.close_near(self.system, t, *self.unpacked(y))
+        return State(q, v, self.system.topology, self.internal(y)), holds
 
 
 def derivative(t: Any, y: Float[Array, " n"], problem: Problem) -> Float[Array, " n"]:

@@ -25,6 +25,7 @@ from linkax.xla.tracing import without_derivatives
 
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
 STAGNATES = 0.9  # rate at which they no longer fall
+ON_THE_WAY = np.array([0.3, 0.6, 0.9])  # of a step: where loops are looked at
 BEYOND = 1.5  # how far after its end a step may leave a passage, in steps
 
 
@@ -222,14 +223,17 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             leaves, passes = stages[0], stages[1:][nearest]
             retry = jnp.asarray(retry_factors(inner_solver.tableau.c), passes.dtype)[nearest]
         closest = jnp.minimum(solver_state.closest, jnp.minimum(passes, arrives))
-        switch = None
+        within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
+        opens = switch = None
+        if self.after_step and args.method.checks_loops(args.system.topology):
+            on_the_way = t0 + jnp.asarray(ON_THE_WAY, t1.dtype) * (t1 - t0)
+            opens = lax.stop_gradient(jnp.max(jax.vmap(lambda t: args.opens(t, within(t)))(on_the_way)))
         if switching:
-            within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
             fixed = without_derivatives((args, t0, t1, y0, y1))
             switch, sides = lax.stop_gradient(meet(*fixed, within=within))
             _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
         state = SolverState(inner, arrives, closest)
-        return y1, StepError(errors, leaves, passes, retry, switch), dense_info, state, result
+        return y1, StepError(errors, leaves, passes, retry, opens, switch), dense_info, state, result
 
     def corrected(
         self, problem: Problem, t1: Float[Array, ""], y1: Float[Array, " n"], sides: Sides

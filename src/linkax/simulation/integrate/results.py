@@ -4,7 +4,10 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Bool
 
+from linkax.xla.arrays import Array
 from linkax.xla.enumerations import code
 
 Solution = Any  # a `linkax.Solution`, of a higher layer
@@ -34,7 +37,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  Equ
         "them. Give them mass and inertia, or a joint that holds them."
     )
     diverged = (
-        "A step of fixed size led to numbers that are not finite. Take smaller steps, or let the step size adapt."
+        "A step of fixed size led to numbers that are not finite, or far off the loops. Take smaller steps, or let the "
+        "step size adapt."
     )
     times_out_of_order = (
         "The times of the run make no sense: t1, saved times and dt0 must be finite, t1 after t0, and saved times in "
@@ -44,6 +48,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  Equ
         "The initial state, the numbers of the mechanism, or its forces there are not finite, or a number is outside "
         "of what it can be, such as a negative length; give finite ones. Outside of JAX transformations such a "
         "mechanism is refused, by an error that names the number."
+    )
+    off_loops = (
+        "A state between two steps lies off the loops, and no state that closes them is near: the steps are too long "
+        "there. Ask for a smaller rtol, or take smaller steps."
     )
     rests_on_stop = (
         "The motion comes to rest on the stop of a `linkax.Impact`, after bounces that follow each other ever faster, "
@@ -65,12 +73,18 @@ KNOWN_RESULTS = (
     "massless",
     "not_finite",
     "times_out_of_order",
+    "off_loops",
     "rests_on_stop",
     "not_reached",
 )
 
 
 ENDED_WELL = ("successful", "event_occurred")
+
+
+def ended_well(result: RESULTS) -> Bool[Array, "*batch"]:
+    """Whether a run ended as it was asked to."""
+    return jnp.stack([result == getattr(RESULTS, name) for name in ENDED_WELL]).any(axis=0)
 
 
 def result_name(result: RESULTS) -> str:

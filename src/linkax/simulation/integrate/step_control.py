@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
+from linkax.formulations.formulation import NEAR
 from linkax.simulation.integrate.diffrax_contract import StepError
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
@@ -16,6 +17,7 @@ from linkax.xla.derivatives import ratio
 NOISE_ULPS = 1.0
 SEEN_ULPS = 512.0  # of estimates: rounding changes larger ones by less than a hundredth
 SEEN = 1e-3  # of the tolerance, which is as small
+OPENS = 1e-3  # radians, or lengths of the mechanism: what loops may open between steps
 FIRST_STEP = 1e-3  # of the whole time
 FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 FIRST_TURN_SINGULAR = 1e-3  # from a singular configuration, where the first stage does not know all of the loops
@@ -113,9 +115,10 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         keep = keep & goes_on
         result = diffrax.RESULTS.where(keep | (proceeds & goes_on), result, diffrax.RESULTS.dt_min_reached)
         if not self.is_adaptive:
-            finite = jnp.all(jnp.isfinite(y1_candidate))
-            result = diffrax.RESULTS.where(finite, result, diffrax.RESULTS.dt_min_reached)
-            return keep & finite, jnp.where(finite, next_t0, t0), next_t1, jump, (after, retries), result
+            holds = jnp.all(jnp.isfinite(y1_candidate))
+            holds = holds if y_error.opens is None else holds & (y_error.opens <= NEAR)
+            result = diffrax.RESULTS.where(holds, result, diffrax.RESULTS.dt_min_reached)
+            return keep & holds, jnp.where(holds, next_t0, t0), next_t1, jump, (after, retries), result
         near = jnp.minimum(args.accuracy.clearance, FEASIBLE * y_error.leaves)
         again = (y_error.passes < near) & (retries < MOST_RETRIES)
         end = t0 + y_error.retry * (t1 - t0)
@@ -141,11 +144,15 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         # The second is none where the step has led to no numbers.
         largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), magnitude, candidate)
         # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
-        least = jnp.minimum(SEEN_ULPS * jnp.finfo(scales[0].dtype).eps, SEEN * self.innermost.rtol)
-        return tuple(
+        inner = self.innermost
+        least = jnp.minimum(SEEN_ULPS * jnp.finfo(scales[0].dtype).eps, SEEN * inner.rtol)
+        of_q, *others = (
             jnp.maximum(jnp.abs(_less(e / scale, noise * size)), least * size)
             for e, scale, size in zip(y_error.error, scales, largest, strict=True)
         )
+        if y_error.opens is not None:
+            of_q = jnp.maximum(of_q, y_error.opens / OPENS * (inner.rtol + inner.atol))
+        return of_q, *others
 
 
 def _magnitudes(problem, y):

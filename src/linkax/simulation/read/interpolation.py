@@ -15,6 +15,7 @@ from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
 from linkax.simulation.read.reading import read, read_in_motion
 from linkax.xla.tracing import concrete, jit_inline
+from linkax.xla.undefined import infinite_where
 
 ROUNDING = 1e-9  # of the time between the first and the last saved one: how far beyond them a time may lie
 
@@ -34,7 +35,7 @@ def motion_at(solution: Solution, ts: Vector | list[Number]) -> Solution:
     saved, asked = concrete(solution.ts), concrete(times)
     if saved is not None and asked is not None:
         _check_within(asked, saved)
-    return _between(solution, times)
+    return _closed(_between(solution, times))
 
 
 def motion_between(solution: Solution, places: Float[np.ndarray, " k"]) -> Solution:
@@ -57,6 +58,22 @@ def _check_within(asked, saved):
             f"time {number:.6g} s is outside of the saved motion, from {np.max(first):.6g} s to {np.min(last):.6g} s; "
             "simulate longer, or save its first and last time"
         )
+
+
+def _closed(motion):
+    """A motion between saved times on its loops; infinite, and where it is one alone an error, where none are near."""
+    if not motion.formulation.checks_loops(motion.mechanism.topology):
+        return motion
+    q, v, holds = read(Observables.closed, motion)
+    there = jnp.isfinite(motion.ts)
+    known = concrete(there & jnp.logical_not(holds)) if motion.ts.ndim == 1 else None
+    if known is not None and np.any(known):
+        raise ValueError(
+            f"between its saved times this motion is not known at t = {float(motion.ts[known][0]):.6g} s, where the "
+            "state between them lies far off the loops; save more often"
+        )
+    q, v = infinite_where(jnp.logical_not(holds), (q, v), (motion.q, motion.v))
+    return dataclasses.replace(motion, q=q, v=v)
 
 
 def _between(solution, ts):
@@ -99,8 +116,7 @@ def _of_member(topology, ts, states):
     finite = [jnp.where(jnp.isfinite(part), part, 0.0) for part in states]
     before, later = ([part[at] for part in finite] for at in (index, index + 1))
     found = jax.vmap(lambda *given: _at(topology, *given))(jnp.where(within, ts, 0.0), before, later)
-    mask = lambda part: jnp.where(within.reshape(-1, *(1,) * (part.ndim - 1)), part, jnp.inf)
-    return [mask(part) for part in found]
+    return infinite_where(jnp.logical_not(within), [*found], (ts, states))
 
 
 def _at(topology, t, before, later) -> tuple[Any, ...]:

@@ -93,6 +93,11 @@ class Observables(NamedTuple):
         assert self.dynamics is not None
         return self.dynamics
 
+    def closed(self) -> tuple[Float[Array, " n_q"], Float[Array, " n_v"], Bool[Array, ""]]:
+        """q and v on the loops, and whether they are, near to where they were."""
+        q, v, holds = self.method.close_near(self.system, self.t, self.q, self.v)
+        return q, v, jnp.asarray(holds)
+
     def solve(self) -> Dynamics:
         return self.method.dynamics(self.system, self.t, self.q, self.v)
 

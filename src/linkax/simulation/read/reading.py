@@ -27,6 +27,7 @@ from linkax.xla.flat import Flat
 from linkax.xla.kept import kept_while_alive
 from linkax.xla.program import Program, runs_often
 from linkax.xla.tracing import all_concrete, is_first
+from linkax.xla.undefined import infinite_where
 from linkax.xla.waiting import compiling
 
 FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
@@ -135,4 +136,5 @@ def evaluate_dense(
     t = jnp.asarray(t, dtype)
     y = interpolation.evaluate(t)
     system, method = system_of(flat, dtype), formulation.prepared(dtype, rank_nearby)
-    return Problem(flat.tree, system, method, accuracy).close(t, y)
+    state, holds = Problem(flat.tree, system, method, accuracy).close(t, y)
+    return infinite_where(jnp.logical_not(holds), state, y)
