@@ -140,8 +140,33 @@ def test_a_mimic_and_a_gearbox_are_couplings(tmp_path):
     found = {part.name: part.arguments for part in machine.constraints}
     assert found["rotor_bearing.mimic"]["coefficients"] == {"rotor_bearing": 1.0, "crank_bearing": -2.0}
     assert found["rotor_bearing.mimic"]["offset"] == pytest.approx(0.1)
-    # θ₁ + ratio θ₂ = 0, with θ₂ about −y
-    assert found["box"]["coefficients"] == {"rotor_bearing": 1.0, "wheel_bearing": -0.25}
+    # θ₂ = −ratio θ₁, with θ₂, of the child, about −y
+    assert found["box"]["coefficients"] == {"rotor_bearing": 0.25, "wheel_bearing": -1.0}
+
+
+# Gears of the motors, and armatures [kg m²], in MuJoCo's model of Cassie (`agility_cassie` of its Menagerie).
+MOTORS = {
+    "roll": (25, 0.038125),
+    "yaw": (25, 0.038125),
+    "pitch": (16, 0.09344),
+    "knee": (16, 0.09344),
+    "foot": (50, 0.01225),
+}
+
+
+def test_rotors_of_cassie_turn_as_its_gears_say():
+    """A rotor turns `gear` times for one turn of the leg, so that its inertia there is gear² times as large."""
+    machine = cassie("cassie", ignore=["contact", "limit", "inertia", "joint"])
+    bodies, joints = ({part.name: part.arguments for part in of} for of in (machine.bodies, machine.joints))
+    gearboxes = {part.name: part.arguments["coefficients"] for part in machine.constraints}
+    for name, (gear, armature) in MOTORS.items():
+        terms = gearboxes[f"left-{name}-joint"]
+        rotor, leg = f"left-{name}-ip", f"left-{name}-op"
+        assert terms[leg] / terms[rotor] == pytest.approx(gear)
+        end = joints[rotor]["child"]
+        axis = end.rotation @ joints[rotor]["axis"]
+        reflected = axis @ bodies[end.body]["inertia"] @ axis * gear**2
+        assert armature / 3.0 < reflected < 3.0 * armature
 
 
 def test_stops_push_and_friction_holds(tmp_path):

@@ -279,12 +279,12 @@ class _Model:
         return pose(numbers[:3], from_angles(self.draft.angles(numbers[3:])))
 
     def _gearbox(self, node: Node) -> None:
-        """θ₁ = −ratio θ₂, of parent and child seen from the reference body, about <axis> and <axis2>."""
+        """θ₂ = −ratio θ₁, of child and parent seen from the reference body, about <axis2> and <axis>."""
         draft, where = self.draft, node.where
         reference = node.content("gearbox_reference_body") or ""
-        ratio, frame = node.number("gearbox_ratio"), self.pose_of(node.name)
+        ratio, frame = node.number("gearbox_ratio", 1.0), self.pose_of(node.name)
         terms: dict[str, float] = {}
-        for end, tag, factor in (("parent", "axis", 1.0), ("child", "axis2", ratio)):
+        for end, tag, factor in (("parent", "axis", ratio), ("child", "axis2", 1.0)):
             link, axis = self._body(node, end), node.child(tag)
             joint = self._hinge_between(reference, link)
             if joint is None:
