@@ -181,7 +181,7 @@ def _unknown(text, known, what="") -> str:
 
 def _positive(text: str) -> float:
     try:
-        number = float(text)
+        number = math.nan if "_" in text or not text.isascii() else float(text)  # as linkax.model.numbers.number_in
     except ValueError:
         number = math.nan
     if not (math.isfinite(number) and number > 0.0):

@@ -141,6 +141,8 @@ WRONG = (
         "a loop of type 'gear'",
     ),
     ('<link name="a"><inertial><mass value="x"/></inertial></link>', r":15: mass: value is 'x'; it must be 1 finite"),
+    ('<link name="a"><inertial><mass value="1_5"/></inertial></link>', "value is '1_5'; it must be 1 finite number"),
+    ('<link name="a"><inertial><mass value="١"/></inertial></link>', "value is '١'; it must be 1 finite number"),
     ("<drake:ball_constraint/>", r'ignore=\["drake:ball_constraint"\]'),
     ('<link name="crank"/>', "twice"),
 )

@@ -42,6 +42,8 @@ def test_files_with_channels_of_different_rates(tmp_path, kind):
 
 
 BAD_FILES = {
+    "an underscore": ("time,angle\n0,1\n1,1_5\n", r"line 3 of .*, column 'angle': '1_5' is no number"),
+    "other digits": ("time,angle\n0,1\n1,١\n", r"line 3 of .*, column 'angle': '١' is no number"),
     "a word": ("time,angle\n0,1\n1,one\n", r"line 3 of .*, column 'angle': 'one' is no number; leave the cell"),
     "no such column": ("time,angel\n0,1\n", "'angle' is not a column of .*; it has 'time', 'angel'"),
     "twice": ("time,angle,angle\n0,1,1\n", "'angle' is the name of several columns"),

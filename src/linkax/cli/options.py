@@ -13,6 +13,7 @@ import diffrax
 import linkax as lx
 from linkax.cli.machine_scene import machine_scene
 from linkax.files import remove_unfinished, writable_folder, written_whole
+from linkax.model.numbers import number_in
 from linkax.scenes import SCENES, Scene, scene
 from linkax.simulation.integrate.default_solver import default_solver
 from linkax.simulation.integrate.rosenbrock import Rodas5P
@@ -138,7 +139,7 @@ def _ignored(arguments) -> list[str]:
 
 def _coordinate(joint, text) -> float:
     try:
-        return float(text)
+        return number_in(text)
     except ValueError as error:
         raise ValueError(f"--hold {joint}={text!r} is no number; write --hold JOINT=VALUE [rad or m]") from error
 

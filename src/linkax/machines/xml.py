@@ -9,6 +9,7 @@ from xml.parsers import expat
 
 import numpy as np
 
+from linkax.model.numbers import number_in
 from linkax.optional import needed
 
 LARGEST = 64 * 2**20  # bytes of a file
@@ -126,7 +127,7 @@ def read_numbers(text: str, count: int, where: Where, what: str = "its text") ->
     **Raises:** `MachineFileError` for others than `count` finite numbers.
     """
     try:
-        found = [float(part) for part in text.split()]
+        found = [number_in(part) for part in text.split()]
     except ValueError:
         found = []
     if len(found) != count or not all(map(math.isfinite, found)):

@@ -70,6 +70,16 @@ def number(entry: Any, shape: tuple[int, ...], what: str) -> Float[Array, "..."]
     return require(array, is_finite, what, "it must be finite")
 
 
+def number_in(text: str, kind: type[float] = float) -> float:
+    """Read a number that a file or a command line gives: in ASCII digits, without the underscores that Python takes.
+
+    **Raises:** `ValueError` for what is no number, or none of that kind.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(f"{text!r} is no number")
+    return kind(text)
+
+
 def is_finite(array: Array | np.floating) -> Any:
     """Tell whether all numbers of an array are finite."""
     known = concrete(array)

@@ -15,6 +15,7 @@ import numpy as np
 
 from linkax.model.mechanism import Mechanism
 from linkax.model.names import meant
+from linkax.model.numbers import number_in
 from linkax.simulation.start.state import State
 from linkax.xla.tracing import concrete
 
@@ -129,7 +130,7 @@ def described(name: str, **functions: Any) -> Scene:
 
 
 def _count(entry: Any) -> int:
-    count = int(entry) if isinstance(entry, str) else operator.index(entry)
+    count = number_in(entry, int) if isinstance(entry, str) else operator.index(entry)
     if isinstance(entry, bool) or count < 1:
         raise ValueError
     return count
@@ -140,6 +141,6 @@ def _finite(entry: Any) -> Any:
         raise ValueError
     if concrete(entry) is None or hasattr(entry, "dtype"):
         return entry
-    if not math.isfinite(number := float(entry)):
+    if not math.isfinite(number := number_in(entry) if isinstance(entry, str) else float(entry)):
         raise ValueError
     return number

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from linkax.model.names import ByName
-from linkax.model.numbers import one_of, positive, real, require_type
+from linkax.model.numbers import number_in, one_of, positive, real, require_type
 from linkax.optional import needed
 from linkax.simulation.read.columns import PARQUET
 from linkax.tables import Rows, Table, count, numbers, printed_as
@@ -250,7 +250,7 @@ def _read_csv(path, asked) -> dict[str, np.ndarray]:
 
 def _cell(text, path, line, column) -> float:
     try:
-        return float(text) if text.strip() else np.nan
+        return number_in(text) if text.strip() else np.nan
     except ValueError:
         raise ValueError(
             f"line {line} of {str(path)!r}, column {column!r}: {text!r} is no number; leave the cell of a missing "
