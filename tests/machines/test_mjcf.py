@@ -141,6 +141,36 @@ def test_two_connects_between_the_same_bodies_are_a_hinge(tmp_path):
     )
 
 
+ONE_NAME = """<mujoco><option><flag contact="disable"/></option><worldbody>
+    <body name="arm"><joint name="arm" axis="0 1 0" stiffness="2" damping="1"/><geom name="arm" size="0.1" pos="1 0 0"/>
+      <site name="arm"/></body>
+    <body name="arm.spring"><joint name="arm.spring" axis="0 1 0"/><geom size="0.1" pos="1 0 0"/></body>
+    <body name="hand"><geom size="0.1"/></body></worldbody>
+  <tendon><fixed name="arm" stiffness="3"><joint joint="arm" coef="0.5"/></fixed></tendon>
+  <equality><joint name="arm" joint1="arm" joint2="arm.spring"/></equality>
+  <actuator><motor name="arm" joint="arm" gear="2"/><motor name="hand.fixed" joint="arm"/>
+    <motor name="gravity" joint="arm"/></actuator>
+  <sensor><jointpos name="arm" joint="arm"/></sensor><keyframe><key name="arm" qpos="0.2 0.2"/></keyframe></mujoco>"""
+
+
+def test_names_are_unique_for_each_kind_in_the_file_and_for_all_in_a_mechanism(tmp_path):
+    """Bodies and joints keep theirs, others get their kind added, and what renamed them is told with its line."""
+    (tmp_path / "arm.xml").write_text(ONE_NAME)
+    machine = lx.load(tmp_path / "arm.xml")
+    assert [part.name for part in machine.bodies] == ["arm", "arm.spring", "hand"]
+    assert [part.name for part in machine.joints] == ["arm", "arm.spring", "hand.fixed"]
+    assert [part.name for part in machine.constraints] == ["arm.equality"]
+    springs = {"arm.spring.joint": 2.0, "arm.spring.tendon": 3.0}
+    motors = {"arm.actuator", "hand.fixed.actuator", "gravity.actuator"}
+    assert {part.name for part in machine.forces} == {"gravity", "arm.damper", *springs, *motors}
+    assert machine.params["forces"]["arm.spring.joint"]["stiffness"] == 2.0
+    renamed = [item for item in machine.left_out if item.kind == "name"]
+    assert len(renamed) == 6
+    assert "it is 'arm.actuator' here, since another has the name 'arm'" in repr(machine)
+    mechanism = machine.mechanism({"forces": {"arm.actuator": {"control": 0.5}}})
+    assert set(mechanism.topology.joints) == {"arm", "arm.spring", "hand.fixed"}
+
+
 DRIVEN = """<mujoco><worldbody><body name="arm"><joint name="pin" axis="0 1 0" {joint}/>
     <geom size="0.1" contype="0" conaffinity="0"/></body></worldbody>
   <tendon><fixed name="belt" {tendon}><joint joint="pin" coef="0.5"/></fixed></tendon>

@@ -114,6 +114,12 @@ def test_a_mimic_and_a_coupling_relate_joints(tmp_path):
     assert found["gear"]["coefficients"] == {"crank_bearing": 3.0, "wheel_bearing": 1.0}
 
 
+def test_a_loop_may_bear_the_name_of_a_joint(tmp_path):
+    machine = load(tmp_path, CLOSED["loop"].replace("rocker_pin", "crank_pin"))
+    assert [part.name for part in machine.joints if "crank_pin" in part.name] == ["crank_pin", "crank_pin.loop"]
+    assert machine.mechanism().topology.num_cuts == 1
+
+
 def test_stops_and_dampers(tmp_path):
     more = '<limit lower="-1" upper="2" effort="9" velocity="1"/><dynamics damping="0.4" friction="0.1"/>'
     machine = load(tmp_path, more=more)

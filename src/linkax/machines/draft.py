@@ -20,7 +20,7 @@ from linkax.model.forces.joint_limits import JointLimit
 from linkax.model.forces.point_forces import PointForce
 from linkax.model.joints.fixed import Fixed
 from linkax.model.joints.free import Free
-from linkax.model.names import meant
+from linkax.model.names import free_name, meant
 from linkax.model.shapes import Shape
 from linkax.xla.users_line import warn
 
@@ -56,7 +56,7 @@ class Draft:
     left_out: list[LeftOut] = dataclasses.field(default_factory=list)
     missing: list[LeftOut] = dataclasses.field(default_factory=list)
     outside: list[str] = dataclasses.field(default_factory=list)
-    _taken: set[tuple[int, str]] = dataclasses.field(default_factory=set)
+    _taken: set[tuple[int, str, str, str]] = dataclasses.field(default_factory=set)
 
     def angles(self, given: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """Angles of a file, [rad], (3,)."""
@@ -211,13 +211,14 @@ class Draft:
         if not self.bodies:
             raise MachineFileError(f"{self.path.name} has no body; give a file of a machine")
         self._hold(base)
-        joints = {part.name: part for part in self.joints}
-        size = self.size
+        joints, size = {part.name: part for part in reversed(self.joints)}, self.size
         forces = [self._completed(part, joints, size) for part in self.forces]
         bodies = [self._drawn(part) for part in self.bodies]
-        for part in (*bodies, *self.joints, *forces, *self.constraints):
-            part.built({})
-        groups = tuple(bodies), tuple(self.joints), tuple(forces), tuple(self.constraints)
+        joints, constraints, forces = self._with_own_names(self.joints, self.constraints, forces)
+        groups = tuple(bodies), joints, forces, constraints
+        for group in groups:
+            for part in group:
+                part.built({})
         self._warn()
         return Machine(self.name or self.path.stem, self.path, *groups, self.starts, tuple(self.left_out))
 
@@ -226,8 +227,27 @@ class Draft:
         shapes = self.shapes.get(body.name)
         return dataclasses.replace(body, arguments={**body.arguments, "shape": tuple(shapes)}) if shapes else body
 
+    def _with_own_names(self, *groups: list[Part]) -> list[tuple[Part, ...]]:
+        """The groups with a name of its own for each part: with its kind in the file, where one before has the name.
+
+        Formats have a name for each kind of element, linkax one for a joint, a constraint or a force. Others go by the
+        names of joints, of those that are added first.
+        """
+        given, used = {part.name for group in groups for part in group}, set[str]()
+
+        def own(part: Part) -> Part:
+            name, where = part.name, part.where
+            if name in used and part.kind is not Gravity:
+                name = free_name(f"{name}.{where.tag}", given | used)
+                self.leave_out(where, "name", f"it is {name!r} here, since another has the name {part.name!r}", False)
+                part = dataclasses.replace(part, arguments={**part.arguments, "name": name})
+            used.add(name)
+            return part
+
+        return [tuple(map(own, group)) for group in groups]
+
     def _add(self, group, kind, arguments, where):
-        taken = (id(group), arguments["name"])
+        taken = (id(group), arguments["name"], where.tag, where.name)
         if taken in self._taken:
             raise where.error(f"the name {arguments['name']!r} is there twice; give each element a name of its own")
         self._taken.add(taken)
@@ -246,7 +266,8 @@ class Draft:
                 continue
             kind, word = (Free, "free") if base == "free" else (Fixed, "fixed")
             parent, child = Place.at(GROUND_NAME, self.poses[body.name]), Place.at(body.name, np.eye(4))
-            arguments = {"name": f"{body.name}.{word}", "parent": parent, "child": child}
+            name = free_name(f"{body.name}.{word}", {joint.name for joint in self.joints})
+            arguments = {"name": name, "parent": parent, "child": child}
             self.joints.insert(0, Part(kind, arguments, body.where))
             reached |= _connected(neighbours, body.name)
 

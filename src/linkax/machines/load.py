@@ -50,6 +50,10 @@ def load(
     how stiff a stop is, the weight of the machine at its size presses it by 0.001 rad; dry friction is nearly viscous
     below 0.01 rad/s. Both are in `Machine.params`.
 
+    Names are unique for each kind of element in a file, and among joints, constraints and forces in a mechanism. Bodies
+    and joints keep theirs; a constraint, a force, or a joint that closes a loop gets its kind in the file added where
+    the name is taken, as "elbow.actuator", and `Machine.left_out` tells so.
+
     What bodies are drawn as is in `Machine.shapes`; meshes that are not there change no motion.
 
     XML is read without entities; other files are read only below the folder of the file.

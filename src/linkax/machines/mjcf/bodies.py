@@ -8,6 +8,7 @@ from linkax.machines.mjcf.shapes import read_shape
 from linkax.machines.parts import Place
 from linkax.machines.poses import from_quaternion, pose, turned
 from linkax.model.joints.fixed import Fixed
+from linkax.model.names import free_name
 
 HIDDEN_GROUP = 3  # geoms of this group and later ones, MuJoCo's viewer hides, such as those of contact alone
 
@@ -20,7 +21,7 @@ def read_body(compiled: Compiled, index: int) -> None:
     own = pose(model.body_pos[index], from_quaternion(model.body_quat[index]))
     drawn = draft.poses[parent] @ own
     first, count = int(model.body_jntadr[index]), int(model.body_jntnum[index])
-    chain = [f"{name}[{step}]" for step in range(1, count)]
+    chain = [free_name(f"{name}[{step}]", compiled.body_names) for step in range(1, count)]
     for between in chain:
         draft.body(between, drawn, 0.0, np.zeros(3), np.zeros((3, 3)), where)
     principal = from_quaternion(model.body_iquat[index])
@@ -43,6 +44,7 @@ def read_body(compiled: Compiled, index: int) -> None:
             read_shape(compiled, geom, name)
     stations = [Place.at(parent, own), *(Place.at(between, np.eye(4)) for between in (*chain, name))]
     if not count:
-        draft.joint_at(Fixed, f"{name}.fixed", stations[0], stations[-1], where)
+        fixed = free_name(f"{name}.fixed", compiled.joint_names)
+        draft.joint_at(Fixed, fixed, stations[0], stations[-1], where)
     for step in range(count):
         read_joint(compiled, first + step, stations[step], stations[step + 1])
