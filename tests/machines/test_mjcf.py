@@ -194,6 +194,24 @@ def test_an_actuator_keeps_the_range_of_what_it_acts_on(tmp_path, on, target):
     assert machine.params["forces"]["motor"]["force_range"].tolist() == [-1.0, 1.5]
 
 
+def test_a_control_of_zero_is_clamped_as_in_mujoco(tmp_path):
+    machine = driven(
+        tmp_path / "driven.xml", actuators='<motor name="motor" joint="pin" ctrlrange="1 2" ctrllimited="true"/>'
+    )
+    assert machine.params["forces"]["motor"]["control"] == 1.0
+    assert [item.reason for item in machine.left_out] == ["controls you give are not clamped to 1 to 2"]
+
+
+def test_pairs_in_contact_are_not_dropped_in_silence(tmp_path):
+    geom = '<geom name="{0}" size="0.1" contype="0" conaffinity="0"/>'
+    body = f'<body name="{{0}}"><joint name="{{0}}"/>{geom}</body>'
+    pair = '<contact><pair geom1="a" geom2="b"/></contact>'
+    bodies = "".join(map(body.format, "ab"))
+    (tmp_path / "pair.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody>{pair}</mujoco>")
+    with pytest.raises(lx.MachineFileError, match="contact of 1 <pair>"):
+        lx.load(tmp_path / "pair.xml", ignore=[])
+
+
 LIMITED = {"joint": 'actuatorfrcrange="-3 5"'}
 TWO = motor("first", 'joint="pin"') + motor("second", 'joint="pin"')
 NEWER = [
@@ -303,6 +321,17 @@ WRONG = (
     ('<mujoco><include file="broken.xml"/></mujoco>', "files include each other"),
     ('<mujoco><asset><mesh file="/etc/hosts"/></asset></mujoco>', "mesh: .* lies outside of the file's folder"),
 )
+
+
+def test_a_name_or_a_file_name_that_mujoco_does_not_read(tmp_path):
+    head = '<?xml version="1.0" encoding="iso-8859-1"?>'
+    text = f'{head}<mujoco><worldbody><body name="a"><geom name="ä" size="1"/></body></worldbody></mujoco>'
+    (tmp_path / "latin.xml").write_bytes(text.encode("latin-1"))
+    with pytest.raises(lx.MachineFileError, match=r"latin.xml: a name in it is not in UTF-8; save it so"):
+        lx.load(tmp_path / "latin.xml")
+    (tmp_path / "upper.XML").write_text(TREE)
+    with pytest.raises(lx.MachineFileError, match=r"upper.XML: .*end in .xml; rename it"):
+        lx.load(tmp_path / "upper.XML")
 
 
 @pytest.mark.parametrize(("text", "message"), WRONG)

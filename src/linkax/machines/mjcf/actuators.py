@@ -27,10 +27,22 @@ def read_actuators(compiled: Compiled) -> None:
                 if np.any(getattr(model, f"actuator_{own}", np.zeros(model.nu))[index]):
                     draft.leave_out(where, "actuator", f"its own {own}")
             law |= _range(compiled, index, target, targets.count(target) == 1, [*terms], where)
-            draft.force(AffineActuator, name, where, transmission=terms, control=0.0, **law)
+            draft.force(
+                AffineActuator, name, where, transmission=terms, control=_control(compiled, index, where), **law
+            )
         elif terms is not None or target[0] != "tendon":
             reason = "an actuator that is not affine, has a state, or acts on no hinge, slide or fixed tendon"
             draft.leave_out(where, "actuator", reason)
+
+
+def _control(compiled: Compiled, index: int, where: Where) -> float:
+    """The control that is zero in MuJoCo, which clamps it to its range; those that a user gives are not clamped."""
+    model = compiled.model
+    if not (model.actuator_ctrllimited[index] and compiled.has("CLAMPCTRL")):
+        return 0.0
+    lower, upper = map(float, model.actuator_ctrlrange[index])
+    compiled.draft.leave_out(where, "ctrlrange", f"controls you give are not clamped to {lower:g} to {upper:g}", False)
+    return min(max(0.0, lower), upper)
 
 
 def _target(compiled: Compiled, index: int) -> tuple[str, int]:

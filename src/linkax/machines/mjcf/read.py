@@ -1,5 +1,7 @@
 """Read an MJCF file: check the files that it names, let MuJoCo compile it, and fill a draft from the model."""
 
+from typing import Any
+
 from linkax.machines.draft import Draft
 from linkax.machines.mjcf.actuators import read_actuators
 from linkax.machines.mjcf.bodies import read_body
@@ -10,6 +12,8 @@ from linkax.machines.mjcf.starts import read_starts
 from linkax.machines.mjcf.tendons import read_tendons
 from linkax.machines.xml import MachineFileError, Node, Where, library
 
+SUFFIXES = (".xml", ".urdf")  # by which MuJoCo knows the format, in these letters
+
 
 def read_mjcf(root: Node, draft: Draft) -> None:
     """Fill a draft from an MJCF file.
@@ -17,14 +21,26 @@ def read_mjcf(root: Node, draft: Draft) -> None:
     **Raises:** `MachineFileError` for what MuJoCo does not read, with its message, and without MuJoCo.
     """
     mujoco = library("mujoco", draft.path, "MJCF, which MuJoCo")
+    if draft.path.suffix not in SUFFIXES:
+        raise MachineFileError(f"{draft.path.name}: MuJoCo reads files whose names end in .xml; rename it")
+    try:
+        _read_model(_compiled(mujoco, root, draft))
+    except UnicodeDecodeError as error:
+        raise MachineFileError(
+            f"{draft.path.name}: a name in it is not in UTF-8; save it so, MuJoCo reads no other"
+        ) from error
+
+
+def _compiled(mujoco: Any, root: Node, draft: Draft) -> Compiled:
     missing = check_files(root, draft)
     try:
         spec = mujoco.MjSpec.from_file(str(draft.path))
         take_out_missing(spec, missing, draft)
-        model = spec.compile()
+        return Compiled(mujoco, spec, spec.compile(), draft)
+    except UnicodeDecodeError:
+        raise
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise MachineFileError(f"{draft.path.name}: MuJoCo does not read it: {' '.join(str(error).split())}") from error
-    _read_model(Compiled(mujoco, spec, model, draft))
 
 
 def _read_model(compiled: Compiled) -> None:
@@ -38,6 +54,8 @@ def _read_model(compiled: Compiled) -> None:
     for count, kind in ((model.nflex, "flex"), (model.nplugin, "plugin"), (model.nskin, "skin")):
         if count:
             draft.leave_out(whole, kind, f"{count} <{kind}>", kind != "skin")
+    if model.npair and compiled.has("CONTACT"):
+        draft.leave_out(whole, "contact", f"contact of {model.npair} <pair>")
     for body in range(1, model.nbody):
         read_body(compiled, body)
     if compiled.has("EQUALITY"):
