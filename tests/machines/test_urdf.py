@@ -140,6 +140,7 @@ def test_words_to_ignore_are_checked(tmp_path):
         load(tmp_path, ignore=3)
 
 
+TURNS = """<link name="a"/><joint name="turns" type="revolute"><parent link="frame"/><child link="a"/>{}</joint>"""
 WRONG = (
     ('<joint name="a" type="fixed"><parent link="frame"/><child link="nobody"/></joint>', r":15: child: .*'nobody'"),
     (
@@ -149,6 +150,16 @@ WRONG = (
     ('<link name="a"><inertial><mass value="x"/></inertial></link>', r":15: mass: value is 'x'; it must be 1 finite"),
     ('<link name="a"><inertial><mass value="1_5"/></inertial></link>', "value is '1_5'; it must be 1 finite number"),
     ('<link name="a"><inertial><mass value="١"/></inertial></link>', "value is '١'; it must be 1 finite number"),
+    ('<link name="a"><inertia ixx="1"/></link>', r":15: inertia: <inertia> is not known \(did you mean 'inertial'"),
+    (TURNS.format('<axes xyz="0 1 0"/>'), r"axes: <axes> is not known \(did you mean 'axis'"),
+    (TURNS.format('<dynamics dampng="1"/>'), r"dynamics: attribute 'dampng' is not known \(did you mean 'damping'"),
+    (TURNS.format('<axis/><axis xyz="0 1 0"/>'), "axis: <axis> is there already; take one out"),
+    (TURNS.format('<mimic joint="turns"/>'), "'turns' follows 'turns', and that way itself"),
+    (
+        TURNS.format('<mimic joint="end1"/>'),
+        "mimic: it follows 'end1', of type 'fixed', without one coord",
+    ),
+    (TURNS.replace("revolute", "universal").format("<axis/>"), "joint 'turns': a universal joint needs two axes"),
     ("<drake:ball_constraint/>", r'ignore=\["drake:ball_constraint"\]'),
     ('<link name="crank"/>', "twice"),
 )
@@ -158,6 +169,23 @@ WRONG = (
 def test_what_the_format_does_not_allow_is_named_with_its_line(tmp_path, closed, message):
     with pytest.raises(lx.MachineFileError, match=message):
         load(tmp_path, closed)
+
+
+def test_joints_that_follow_each_other_in_a_ring_are_refused(tmp_path):
+    ring = TURNS.format('<mimic joint="crank_bearing"/>')
+    with pytest.raises(lx.MachineFileError, match="'turns' follows 'crank_bearing', and that way itself"):
+        load(tmp_path, ring, more='<mimic joint="turns"/>')
+
+
+def test_what_no_reader_asks_for_is_told(tmp_path):
+    """Elements and attributes that are not known, each with the element that they are in, and no more of them."""
+    given = '<limit lower="-1" upper="1" effort="9" velocity="1"/><calibration rising="0"/><calibration rising="1"/>'
+    machine = load(tmp_path, TURNS.format(given), more="<velocity/>")
+    assert [str(item) for item in machine.left_out] == [
+        "four_bar.urdf:4: joint 'crank_bearing': <velocity> in it: not read",
+        "four_bar.urdf:15: limit: effort, velocity in it: not read",
+        "four_bar.urdf:15: joint 'turns': <calibration> in it: not read",
+    ]
 
 
 def test_names_of_parameters_are_checked(tmp_path):

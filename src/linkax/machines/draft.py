@@ -11,8 +11,9 @@ from jaxtyping import Float
 from linkax.machines.machine import LeftOut, Machine, Start
 from linkax.machines.parts import Part, Place
 from linkax.machines.poses import relative, turned, whole
-from linkax.machines.xml import MachineFileError, Where
+from linkax.machines.xml import MachineFileError, Node, Where
 from linkax.model.bodies import GROUND_NAME, RigidBody
+from linkax.model.constraints.constraint import Coupling
 from linkax.model.forces.contact_law import ContactLaw
 from linkax.model.forces.force import Gravity
 from linkax.model.forces.joint_forces import JointDamper, JointFriction, JointSpring
@@ -56,6 +57,7 @@ class Draft:
     left_out: list[LeftOut] = dataclasses.field(default_factory=list)
     missing: list[LeftOut] = dataclasses.field(default_factory=list)
     outside: list[str] = dataclasses.field(default_factory=list)
+    _leaders: dict[Any, Any] = dataclasses.field(default_factory=dict)
     _taken: set[tuple[int, str, str, str]] = dataclasses.field(default_factory=set)
 
     def angles(self, given: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -66,6 +68,12 @@ class Draft:
         """Note what is left out; what changes the motion must be in `ignore`."""
         known = self.missing if changes_motion and kind not in self.ignore else self.left_out
         known.append(LeftOut(where, kind, reason))
+
+    def leave_out_unread(self, root: Node) -> None:
+        """Note what no reader asked for, once all that is read of a file is read."""
+        told = {item.where for item in (*self.left_out, *self.missing)}
+        for where, kind, reason, changes_motion in root.unread(told):
+            self.leave_out(where, kind, reason, changes_motion)
 
     def ignores(self, kind: str, where: Where, what: str) -> bool:
         """Tell whether a kind of thing that could be modelled is to be left out, and note that."""
@@ -134,6 +142,19 @@ class Draft:
     def constraint(self, kind: type, name: str, where: Where, **arguments: Any) -> None:
         """Add a constraint."""
         self._add(self.constraints, kind, {"name": name, **arguments}, where)
+
+    def follow(self, name: str, where: Where, follower: Any, leader: Any, factor: float, offset: float) -> None:
+        """Add follower = factor × leader + offset, of coordinates by their joints.
+
+        **Raises:** `MachineFileError` for one that follows itself, through others, too.
+        """
+        self._leaders[follower] = leader
+        first = leader
+        while first != follower and first in self._leaders:
+            first = self._leaders[first]
+        if first == follower:
+            raise where.error(f"{follower!r} follows {leader!r}, and that way itself; let it follow another joint")
+        self.constraint(Coupling, name, where, coefficients={follower: 1.0, leader: -factor}, offset=offset)
 
     def gravity(self, acceleration: Any, where: Where) -> None:
         """Add gravity [m/s²], (3,)."""

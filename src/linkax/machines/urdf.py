@@ -31,7 +31,8 @@ KINDS = {
 }  # fmt: skip
 WITH_AXIS = (Revolute, Prismatic, Planar, Cylindrical)
 GRAVITY = (0.0, 0.0, -9.81)  # of which the format says nothing
-SEEN_ONLY = ("material", "gazebo", "transmission", "sensor", "mujoco", "safety_controller", "calibration")
+READ = ("link", "joint", "material", "loop", "constraint", "coupling")
+SEEN_ONLY = ("gazebo", "transmission", "sensor", "mujoco")
 ZERO = (0.0, 0.0, 0.0)
 OF_YAML = {"3d": Spherical, "6d": Fixed}
 
@@ -42,6 +43,7 @@ def read_urdf(root: Node, draft: Draft) -> None:
     **Raises:** `MachineFileError` for what the format does not allow, with line and remedy.
     """
     _Robot(root, draft).read()
+    draft.leave_out_unread(root)
 
 
 class _Robot:
@@ -50,14 +52,14 @@ class _Robot:
     def __init__(self, root: Node, draft: Draft) -> None:
         self.root, self.draft = root, draft
         self.links = {link.name: link for link in root.all("link")}
-        self.materials = {node.attributes.get("name", ""): node for node in root.all("material")}
+        self.materials = {node.get("name"): node for node in root.all("material")}
         self.joints: dict[str, Node] = {}
         self.carrier: dict[str, tuple[str, str]] = {}  # of a link: its parent in the tree of joints, and the joint
 
     def read(self) -> None:
         """Read links where the joints carry them, then joints, then what closes loops."""
         root, draft = self.root, self.draft
-        draft.name = root.attributes.get("name", "")
+        draft.name = root.get("name")
         draft.gravity(GRAVITY, root.where)
         joints = root.all("joint")
         for joint in joints:
@@ -69,15 +71,16 @@ class _Robot:
             self._body(link)
         for joint in joints:
             self._joint(joint, joint.name in carried)
-        for node in root:
+        for node in root.all("loop", "constraint", "coupling"):
             if node.tag == "loop":
                 ends = (self._end(node, "predecessor"), self._end(node, "successor", "sucessor"))
                 self._loop(node, *ends, {"axis": node.find("axis")})
             elif node.tag == "constraint":
                 self._constraint(node)
-            elif node.tag == "coupling":
+            else:
                 self._coupling(node)
-            elif node.tag not in ("link", "joint", "material"):
+        for node in root:
+            if node.tag not in READ:
                 known = node.tag in SEEN_ONLY
                 reason = f"<{node.tag}> does not move anything" if known else f"<{node.tag}> is not known"
                 draft.leave_out(node.where, node.tag, reason, not known)
@@ -85,7 +88,7 @@ class _Robot:
     def _link(self, node: Node, tag: str) -> str:
         """The name of the link at one end."""
         given = node.child(tag)
-        name = given.attributes.get("link") or given.attribute("name")
+        name = given.get("link") or given.attribute("name")
         if name not in self.links:
             raise given.where.error(f"{tag} is {name!r}, which is no link of the file")
         return name
@@ -118,20 +121,17 @@ class _Robot:
             xx, yy, zz, xy, xz, yz = map(entry, ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
             inertia = turned(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), at[:3, :3])
         self.draft.body(node.name, self._pose_of(node.name), mass, at[:3, 3], inertia, node.where)
-        for child in node:
-            if child.tag == "collision":
-                self.draft.leave_out(child.where, "contact", "contact of this shape with others")
-            elif child.tag == "visual":
-                self._visual(node.name, child)
-            elif child.tag != "inertial":
-                self.draft.leave_out(child.where, child.tag, f"<{child.tag}> does not move anything", False)
+        for child in node.all("collision"):
+            self.draft.leave_out(child.where, "contact", "contact of this shape with others")
+        for child in node.all("visual"):
+            self._visual(node.name, child)
 
     def _visual(self, link: str, node: Node) -> None:
         """A shape that is only seen; what is not kept of it is noted."""
         try:
             material = node.find("material")
             if material is not None and material.find("color") is None:
-                material = self.materials.get(material.attributes.get("name", ""))
+                material = self.materials.get(material.get("name"))
             colour = None if material is None else material.find("color")
             rgba = None if colour is None else colour.numbers("rgba", 4)
             read_visual(self.draft, link, node, self._origin(node.find("origin")), rgba)
@@ -143,9 +143,7 @@ class _Robot:
         if kind not in KINDS:
             draft.leave_out(where, "joint", f"a joint of type {kind!r}; linkax reads {', '.join(KINDS)}")
             return
-        arguments: dict[str, Any] = {} if carries else {"cut": True}
-        if KINDS[kind] in WITH_AXIS:
-            arguments["axis"] = _axis(node.find("axis"))
+        arguments = _axes(node, KINDS[kind], {"axis": node.find("axis")}) | ({} if carries else {"cut": True})
         ends = (
             Place.at(self._link(node, "parent"), self._origin(node.find("origin"))),
             Place.at(self._link(node, "child"), np.eye(4)),
@@ -160,17 +158,21 @@ class _Robot:
             lower, upper = (float(limit.numbers(end, 1, [0.0])[0]) for end in ("lower", "upper"))
             draft.limit(node.name, node.name, limit.where, lower, upper)
         if (mimic := node.find("mimic")) is not None:
-            leader = mimic.attribute("joint")
-            if leader not in self.joints:
-                raise mimic.where.error(f"it follows {leader!r}, which is no joint of the file")
-            factor, offset = (
-                float(mimic.numbers(*given)[0]) for given in (("multiplier", 1, [1.0]), ("offset", 1, [0.0]))
+            self._mimic(node, mimic)
+
+    def _mimic(self, node: Node, mimic: Node) -> None:
+        """Its coordinate = multiplier × that of the leader + offset."""
+        leader = mimic.attribute("joint")
+        if leader not in self.joints:
+            raise mimic.where.error(f"it follows {leader!r}, which is no joint of the file")
+        factor, offset = (float(mimic.numbers(*given)[0]) for given in (("multiplier", 1, [1.0]), ("offset", 1, [0.0])))
+        kind = self.joints[leader].attribute("type")
+        if KINDS.get(kind) not in (Revolute, Prismatic):
+            self.draft.leave_out(
+                mimic.where, "mimic", f"it follows {leader!r}, of type {kind!r}, without one coordinate"
             )
-            coefficients = {node.name: 1.0, leader: -factor}
-            draft.constraint(Coupling, f"{node.name}.mimic", mimic.where, coefficients=coefficients, offset=offset)
-        for child in node:
-            if child.tag in SEEN_ONLY:
-                draft.leave_out(child.where, child.tag, f"<{child.tag}> is for controllers", False)
+            return
+        self.draft.follow(f"{node.name}.mimic", mimic.where, node.name, leader, factor, offset)
 
     def _end(self, node: Node, *tags: str) -> Place:
         """The place of one end of a <loop>."""
@@ -192,14 +194,8 @@ class _Robot:
         if kind not in KINDS:
             self.draft.leave_out(node.where, node.tag, f"a loop of type {kind!r}; linkax reads {', '.join(KINDS)}")
             return
-        arguments: dict[str, Any] = {"cut": True}
-        if KINDS[kind] in (*WITH_AXIS, Universal):
-            arguments["axis"] = _axis(axes["axis"])
-        if KINDS[kind] is Universal:
-            if axes.get("second_axis") is None:
-                raise node.where.error("a universal joint needs two axes; give <parent_axis> and <child_axis>")
-            arguments["second_axis"] = _axis(axes["second_axis"])
-        self.draft.joint_at(KINDS[kind], node.name, first, second, node.where, **arguments)
+        arguments = _axes(node, KINDS[kind], axes)
+        self.draft.joint_at(KINDS[kind], node.name, first, second, node.where, cut=True, **arguments)
 
     def _coupling(self, node: Node) -> None:
         """θ of the successor = ratio × θ of the predecessor, both from the nearest link that carries the two."""
@@ -249,6 +245,15 @@ def close_by_yaml(draft: Draft, path: Path) -> None:
             raise where.error(f"type {kind!r} of {pair!r} is not known; known: {', '.join(OF_YAML)}")
         first, second = (Place.at(str(link), np.eye(4)) for link in pair)
         draft.joint_at(OF_YAML[str(kind).lower()], f"closed_loop[{index}]", first, second, where, cut=True)
+
+
+def _axes(node: Node, kind: type, given: Mapping[str, Node | None]) -> dict[str, Any]:
+    """The axes that a joint of a kind has, as its class takes them."""
+    if kind is not Universal:
+        return {"axis": _axis(given["axis"])} if kind in WITH_AXIS else {}
+    if given.get("second_axis") is None:
+        raise node.where.error("a universal joint needs two axes; give <constraint>, <parent_axis> and <child_axis>")
+    return {name: _axis(axis) for name, axis in given.items()}
 
 
 def _axis(node: Node | None):

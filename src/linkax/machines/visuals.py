@@ -21,6 +21,7 @@ def read_visual(draft: Draft, body: str, node: Node, at: Pose, colour: Any) -> N
 
     **Raises:** `ValueError` for a shape that linkax does not draw, and a mesh that is not there.
     """
+    node.moves_nothing()
     shape = next((child for child in node.child("geometry") if child.tag in SIZES), None)
     if shape is None:
         raise ValueError(f"its geometry is none of {', '.join(SIZES)}")

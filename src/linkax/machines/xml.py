@@ -2,13 +2,14 @@
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
 
+from linkax.model.names import meant
 from linkax.model.numbers import number_in
 from linkax.optional import needed
 
@@ -39,12 +40,17 @@ class Where(NamedTuple):
 
 
 class Node:
-    """An element of XML: `tag`, `attributes`, `text`, `children`, and `where` it is."""
+    """An element of XML: `tag`, `attributes`, `text`, `children`, and `where` it is.
+
+    It remembers what a reader asks of it by its methods, so that `unread` tells what no reader asked for.
+    """
 
     def __init__(self, path: Path, line: int, tag: str, attributes: dict[str, str]) -> None:
         self.tag, self.attributes, self.text = tag, attributes, ""
         self.children: list[Node] = []
         self.path, self.line = path, line
+        self._asked = set[str]()  # attributes and tags that were asked for, there or not
+        self._is_read = self._is_told = False
 
     @property
     def where(self) -> Where:
@@ -59,26 +65,38 @@ class Node:
         """
         return self.attribute("name")
 
+    def get(self, name: str, default: str = "") -> str:
+        """The text of an attribute, which may be absent."""
+        self._asked.add(name)
+        return self.attributes.get(name, default).strip()
+
     def attribute(self, name: str) -> str:
         """The text of an attribute that must be there.
 
         **Raises:** `MachineFileError` without it.
         """
-        found = self.attributes.get(name, "").strip()
+        found = self.get(name)
         if not found:
             raise self.where.error(f'it has no {name}; give {name}="..."')
         return found
 
     def all(self, *tags: str) -> list["Node"]:
         """The children with one of several tags."""
-        return [child for child in self.children if child.tag in tags]
+        self._asked.update(tags)
+        found = [child for child in self.children if child.tag in tags]
+        for child in found:
+            child._is_read = True
+        return found
 
     def find(self, way: str) -> "Node | None":
         """The first child of a tag, or along tags separated by "/"."""
-        node: Node | None = self
-        for tag in way.split("/"):
-            node = None if node is None else next(iter(node.all(tag)), None)
-        return node
+        tag, _, rest = way.partition("/")
+        self._asked.add(tag)
+        found = next((child for child in self.children if child.tag == tag), None)
+        if found is None:
+            return None
+        found._is_read = True
+        return found.find(rest) if rest else found
 
     def child(self, tag: str) -> "Node":
         """The first child of a tag, which must be there.
@@ -112,10 +130,43 @@ class Node:
 
         **Raises:** `MachineFileError` for others than `count` finite numbers, and where there are none and no default.
         """
-        text = self.attributes.get(name)
-        if text is None and default is not None:
+        self._asked.add(name)
+        if name not in self.attributes and default is not None:
             return np.array(default, dtype=float)
         return read_numbers(self.attribute(name), count, self.where, name)
+
+    def moves_nothing(self) -> None:
+        """Note that nobody need be told what no reader asks of the element, and of what is in it."""
+        self._is_told = True
+
+    def unread(self, told: Container[Where]) -> Iterator[tuple[Where, str, str, bool]]:
+        """Say what no reader asked for: where, the name, the reason, and whether a reader should have read it.
+
+        It should where the name is nearly one that was looked for in vain, or an element is there once too often.
+
+        **Arguments:** `told`: elements of which it is told already.
+        """
+        absent = self._asked - set(self.attributes) - {child.tag for child in self.children}
+        others = []
+        unknown = [name for name in self.attributes if name not in ("name", *self._asked) and name[:5] != "xmlns"]
+        for name in unknown:
+            if close := meant(name, absent):
+                yield self.where, name, f"attribute {name!r} is not known{close}", True
+            else:
+                others.append(name)
+        for child in self.children:
+            if child._is_told or child.where in told:
+                continue
+            if child._is_read:
+                yield from child.unread(told) if child._asked else ()
+            elif child.tag in self._asked:
+                yield child.where, child.tag, f"<{child.tag}> is there already; take one out", True
+            elif close := meant(child.tag, absent):
+                yield child.where, child.tag, f"<{child.tag}> is not known{close}", True
+            elif f"<{child.tag}>" not in others:
+                others.append(f"<{child.tag}>")
+        if others:
+            yield self.where, "unread", f"{', '.join(others)} in it: not read", False
 
     def __iter__(self) -> Iterator["Node"]:
         return iter(self.children)
