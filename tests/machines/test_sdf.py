@@ -102,6 +102,82 @@ def test_an_axis_is_in_the_frame_that_the_file_says(tmp_path):
     assert np.allclose(model.arguments["parent"].rotation @ model.arguments["axis"], [0.0, 1.0, 0.0])
 
 
+@pytest.mark.parametrize(
+    ("version", "flag", "in_model"),
+    [
+        ("1.4", "", True), ("1.5", "", False), ("1.9.0", "", False), ("1.10", "", False), ("1.12", "", False),
+        ("1.6", "True", True), ("1.6", "1", True), ("1.6", "FALSE", False),
+    ],
+)  # fmt: skip
+def test_an_axis_is_in_the_frame_of_its_version(tmp_path, version, flag, in_model):
+    """Before 1.5 an axis is in the model's frame, and later in the joint's; 1.10 is later than 1.5."""
+    flag = f"<use_parent_model_frame>{flag}</use_parent_model_frame>" if flag else ""
+    text = FOUR_BAR.format(version=version, inertial=INERTIAL, axis=f"<axis><xyz>0 1 0</xyz>{flag}</axis>", more="")
+    text = text.replace("<pose>0 0 0 0 0 0</pose>", "<pose>0 0 0 0 0 1.5707963267948966</pose>", 1)
+    joint = load(tmp_path / "turned.sdf", text).joints[0].arguments
+    expected = [0.0, 1.0, 0.0] if in_model else [-1.0, 0.0, 0.0]
+    assert np.allclose(joint["parent"].rotation @ joint["axis"], expected)
+
+
+def test_a_joint_is_placed_in_its_child_even_where_that_is_a_frame(tmp_path):
+    """The pose of a joint is in the frame that <child> names, and the joint attaches to the link of that frame."""
+    more = f"""<link name="tip"><pose>0 0 3 0 0 0</pose>{INERTIAL}</link>
+    <frame name="end" attached_to="tip"><pose>0.5 0 0 0 0 0</pose></frame>
+    <joint name="weld" type="fixed"><pose>0 0.25 0 0 0 0</pose><parent>crank</parent><child>end</child></joint>"""
+    weld = next(joint for joint in four_bar(tmp_path, more=more).joints if joint.name == "weld").arguments
+    assert weld["child"].body == "tip"
+    assert np.allclose(weld["child"].offset, [0.5, 0.25, 0.0])
+
+
+def test_the_pose_of_a_model_is_that_of_its_placement_frame(tmp_path):
+    text = FOUR_BAR.format(version="1.9", inertial=INERTIAL, axis=ALONG_Y, more="<pose>5 0 0 0 0 0</pose>")
+    text = text.replace('name="four_bar"', 'name="four_bar" placement_frame="rocker"')
+    bearing = next(joint for joint in load(tmp_path / "placed.sdf", text).joints if joint.name == "rocker_bearing")
+    assert np.allclose(bearing.arguments["parent"].offset, [5.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("version", "place"), [("1.5", "<physics>{}</physics>"), ("1.6", "{}")])
+def test_gravity_is_where_the_version_has_it(tmp_path, version, place):
+    """Of the world since 1.6, before of its physics."""
+    text = FOUR_BAR.format(version=version, inertial=INERTIAL, axis=ALONG_Y, more="")
+    given = place.format("<gravity>0 0 -1.6</gravity>")
+    text = text.replace("<model", f'<world name="moon">{given}<model').replace("</model>", "</model></world>")
+    gravity = load(tmp_path / "moon.sdf", text).forces[0]
+    assert gravity.arguments["acceleration"].tolist() == [0.0, 0.0, -1.6]
+
+
+def test_springs_dampers_and_ends_along_each_axis(tmp_path):
+    """τ = −stiffness (q − reference) − damping q̇, about <axis> and then <axis2>, where the axis of a ball has none."""
+    along = """<{0}><xyz>{1}</xyz><limit><lower>-inf</lower><upper>{2}</upper></limit><dynamics><damping>{3}</damping>
+      <spring_stiffness>{4}</spring_stiffness><spring_reference>0.2</spring_reference></dynamics></{0}>"""
+    axes = along.format("axis", "1 0 0", 0.5, 1, 3) + along.format("axis2", "0 1 0", 1e16, 2, 4)
+    machine = four_bar(tmp_path, more=extra_link("cross", axes, "universal") + extra_link("ball", ALONG_Y, "ball"))
+    joint = next(part.arguments for part in machine.joints if part.name == "cross_bearing")
+    assert [joint["axis"].tolist(), joint["second_axis"].tolist()] == [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    forces = {part.name: part.arguments for part in machine.forces}
+    for index, name in enumerate(("cross_bearing", "cross_bearing.2")):
+        spring, damper = forces[f"{name}.spring"], forces[f"{name}.damper"]
+        assert spring["joint"] == damper["joint"] == ("cross_bearing", index)
+        assert (spring["stiffness"], spring["free"], damper["damping"]) == (3.0 + index, 0.2, 1.0 + index)
+    assert forces["cross_bearing.limit"]["upper"] == 0.5
+    assert "lower" not in forces["cross_bearing.limit"]
+    assert "cross_bearing.2.limit" not in forces
+    assert [item.kind for item in machine.left_out] == ["axis"]
+
+
+def test_a_mimic_follows_the_axis_that_it_names(tmp_path):
+    """follower = multiplier (leader − reference) + offset."""
+    axes = "<axis><xyz>1 0 0</xyz></axis><axis2><xyz>0 1 0</xyz></axis2>"
+    mimic = '<mimic joint="{}" axis="axis2"><multiplier>2</multiplier><reference>0.1</reference></mimic>'
+    follows = f"<axis><xyz>0 1 0</xyz>{mimic}</axis>"
+    more = extra_link("cross", axes, "universal") + extra_link("wheel", follows.format("cross_bearing"))
+    (coupling,) = four_bar(tmp_path, more=more).constraints
+    assert coupling.arguments["coefficients"] == {"wheel_bearing": 1.0, ("cross_bearing", 1): -2.0}
+    assert coupling.arguments["offset"] == pytest.approx(-0.2)
+    with pytest.raises(lx.MachineFileError, match="no coordinate about axis, or axis2 of 'crank_bearing'"):
+        four_bar(tmp_path, more=extra_link("wheel", follows.format("crank_bearing")))
+
+
 def test_poses_are_relative_to_frames(tmp_path):
     more = """<frame name="top" attached_to="crank"><pose>0 0 1 0 0 0</pose></frame>
     <link name="tip"><pose relative_to="top" degrees="true">0.5 0 0 0 0 90</pose></link>
@@ -179,10 +255,19 @@ def test_stops_push_and_friction_holds(tmp_path):
     assert forces["crank_bearing.friction"].params["torque"] == 0.2
 
 
-def test_a_screw_advances(tmp_path):
-    link = extra_link("nut", f"{ALONG_Y}<screw_thread_pitch>0.01</screw_thread_pitch>", "screw")
+@pytest.mark.parametrize(
+    ("pitch", "advance"),
+    [
+        ("<screw_thread_pitch>0.01</screw_thread_pitch>", 0.01 / (2.0 * np.pi)),
+        ("<thread_pitch>500</thread_pitch>", -1.0 / 500.0),
+        ("<thread_pitch>500</thread_pitch><screw_thread_pitch>0.01</screw_thread_pitch>", 0.01 / (2.0 * np.pi)),
+    ],
+)
+def test_a_screw_advances(tmp_path, pitch, advance):
+    """By `screw_thread_pitch` for a turn, right-handed, or 1 m for `thread_pitch` rad, left-handed [m/rad]."""
+    link = extra_link("nut", f"{ALONG_Y}{pitch}", "screw")
     thread = next(joint for joint in four_bar(tmp_path, more=link).joints if joint.name == "nut_bearing")
-    assert thread.arguments["pitch"] == pytest.approx(0.01 / (2.0 * np.pi))
+    assert thread.arguments["pitch"] == pytest.approx(advance)
 
 
 def test_a_base_that_nothing_holds_is_free_or_fixed(tmp_path):
@@ -206,6 +291,29 @@ WRONG = (
     (JOINT.format(name="j", kind="fixed", parent="top") + '<frame name="top" attached_to="top"/>', "to itself; attach"),
     ('<link name="x"><inertial><mass>-1</mass></inertial></link>', r"link 'x'.*mass"),
     ("<include><uri>model://other</uri></include>", r'ignore=\["include"\]'),
+    ('<link name="x"><pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose></link>', "pose: its quaternion is 0 0 0 0"),
+    ('<link name="x"><pose rotation_format="euler">0 0 0 0 0 0</pose></link>', "'euler'; known: euler_rpy, quat_xyzw"),
+    ('<link name="x"><pose degrees="yes">0 0 0 0 0 0</pose></link>', "pose: 'yes' is neither true nor false"),
+    (
+        '<link name="x"><inertial><pose relative_to="crank"/></inertial></link>',
+        "relative to 'crank'; give it in the link",
+    ),
+    (
+        '<link name="x"><velocity_decay><linear>0,1</linear></velocity_decay></link>',
+        "linear: its text is '0,1'; it must",
+    ),
+    (
+        '<link name="x"><kinematic>true</kinematic></link>',
+        r'the link is moved, and not by[\s\S]*ignore=\["kinematic"\]',
+    ),
+    (
+        extra_link("x", "<axis><mimic joint='x_bearing'/></axis>"),
+        "'x_bearing' follows 'x_bearing', and that way itself",
+    ),
+    (extra_link("x", f"{ALONG_Y}<thread_pitch>0</thread_pitch>", "screw"), "thread_pitch is 0; give radians for one"),
+    (extra_link("x", ALONG_Y, "screw"), "it has no <screw_thread_pitch>"),
+    (extra_link("x", "<axis><xyz>0 1 0</xyz><dynamic/></axis>"), r"<dynamic> is not known \(did you mean 'dynamics'"),
+    ('<link name="x"><inertial><mass>1</mass><mass>2</mass></inertial></link>', "mass: <mass> is there already"),
 )
 
 
@@ -213,3 +321,18 @@ WRONG = (
 def test_what_the_format_does_not_allow_is_named_with_its_line(tmp_path, more, message):
     with pytest.raises(lx.MachineFileError, match=message):
         four_bar(tmp_path, more=more)
+
+
+def test_a_version_is_numbers(tmp_path):
+    with pytest.raises(lx.MachineFileError, match="sdf: version is 'new'; give one such as"):
+        four_bar(tmp_path, version="new")
+
+
+def test_what_no_reader_asks_for_is_told(tmp_path):
+    more = extra_link("x", "<axis><xyz>0 1 0</xyz><initial_position>1</initial_position></axis><sensor/><physics/>")
+    machine = four_bar(tmp_path, more=f"{more}<plugin/>")
+    assert [str(item).partition(": ")[2] for item in machine.left_out] == [
+        "axis: where the joint is at the start; give it to linkax.assemble",
+        "joint 'x_bearing': <sensor>, <physics> in it: not read",
+        "model 'four_bar': <plugin> in it: not read",
+    ]

@@ -45,9 +45,10 @@ def load(
     hinge. Coordinates are zero where the machine stands as drawn; in USD where a joint's two frames coincide, and
     `Machine.starts["drawn"]` has those of the drawing where it is another place.
 
-    What linkax does not model is in `Machine.left_out`. Where that changes the motion it must be in `ignore`, and a
-    warning (`LeftOutWarning`) names some of it. Stops and dry friction have laws of linkax: where the file does not say
-    how stiff a stop is, the weight of the machine at its size presses it by 0.001 rad; dry friction is nearly viscous
+    What linkax does not model is in `Machine.left_out`, and what it does not know in URDF and SDF, too. Where that
+    changes the motion, or is nearly the name of something that is missing, it must be in `ignore`, and a warning
+    (`LeftOutWarning`) names some of it. Stops and dry friction have laws of linkax: where the file does not say how
+    stiff a stop is, the weight of the machine at its size presses it by 0.001 rad; dry friction is nearly viscous
     below 0.01 rad/s. Both are in `Machine.params`.
 
     Names are unique for each kind of element in a file, and among joints, constraints and forces in a mechanism. Bodies
