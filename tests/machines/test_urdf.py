@@ -67,6 +67,45 @@ def test_yaml_closes_loops(tmp_path):
         load(tmp_path, closures=tmp_path / "closed.yaml")
 
 
+@pytest.mark.parametrize(
+    ("word", "kind", "axes"),
+    [("SPHERICAL", lx.Spherical, ""), ("FIXED", lx.Fixed, ""), ("UJOINT_ZY", lx.Universal, "zy")],
+)
+def test_yaml_makes_joints_of_types_that_urdf_has_not(tmp_path, word, kind, axes):
+    """A universal joint turns about the first axis of its frame, then the second; what acted along it goes."""
+    path = tmp_path / "types.yaml"
+    path.write_text(f"joint_name: [crank_bearing]\njoint_type: [{word}]\nname_mot: [crank_pin]\n")
+    machine = load(tmp_path, more='<dynamics damping="1"/><limit lower="1" upper="2"/>', closures=path)
+    (joint,) = (part for part in machine.joints if part.name == "crank_bearing")
+    assert joint.kind is kind
+    found = [joint.arguments[name] for name in ("axis", "second_axis") if name in joint.arguments]
+    assert np.array_equal(np.reshape(found, (-1, 3)), np.eye(3)[["xyz".index(axis) for axis in axes]])
+    assert [part.name for part in machine.forces] == ["gravity"]
+    told = {item.reason for item in machine.left_out if item.kind in ("joint", "name_mot")}
+    assert {reason.split(" ")[0] for reason in told} == {"'crank_bearing.damper'", "'crank_bearing.limit'", "which"}
+    assert machine.mechanism().topology.joints
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("joint_name: [crank_bearing]", "types.yaml:1: joint_name: it and joint_type must be lists of the same length"),
+        ("joint_name: [crank_bearing]\njoint_type: [UJOINT_XX]", "'UJOINT_XX' is not known; known: SPHERICAL"),
+        (
+            "joint_name: [crank]\njoint_type: [FIXED]",
+            r"'crank' is no joint of four_bar.urdf \(did you mean 'crank_pin'",
+        ),
+        ("closed_loops: []", r"closed_loops: it is not known \(did you mean 'closed_loop'"),
+        ("closed_loop: [[crank, rocker]]\ntype: [7d]", "type '7d' of .* is not known; known: 3d, 6d"),
+        ("3", "types.yaml:1: closed_loop: the file has no closed_loop; give"),
+    ],
+)
+def test_what_a_yaml_file_may_not_say_is_named(tmp_path, text, message):
+    (tmp_path / "types.yaml").write_text(text)
+    with pytest.raises(lx.MachineFileError, match=message):
+        load(tmp_path, closures=tmp_path / "types.yaml")
+
+
 def test_the_four_bar_moves_as_one_written_by_hand(tmp_path):
     """The same accelerations, and derivatives in a number of the file."""
     machine = load(tmp_path, CLOSED["loop"])

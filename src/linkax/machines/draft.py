@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from linkax.machines.machine import LeftOut, Machine, Start
-from linkax.machines.parts import Part, Place
+from linkax.machines.machine import LeftOut, Machine, Start, acts_along
+from linkax.machines.parts import STRUCTURE, Part, Place
 from linkax.machines.poses import relative, turned, whole
 from linkax.machines.xml import MachineFileError, Node, Where
 from linkax.model.bodies import GROUND_NAME, RigidBody
@@ -56,7 +56,6 @@ class Draft:
     starts: dict[str, Start] = dataclasses.field(default_factory=dict)
     left_out: list[LeftOut] = dataclasses.field(default_factory=list)
     missing: list[LeftOut] = dataclasses.field(default_factory=list)
-    outside: list[str] = dataclasses.field(default_factory=list)
     _leaders: dict[Any, Any] = dataclasses.field(default_factory=dict)
     _taken: set[tuple[int, str, str, str]] = dataclasses.field(default_factory=set)
 
@@ -135,6 +134,18 @@ class Draft:
         """Add a joint from its places on both bodies."""
         self._add(self.joints, kind, {"name": name, "parent": parent, "child": child, **arguments}, where)
 
+    def retype(self, name: str, kind: type, where: Where, **axes: Any) -> None:
+        """Make a joint one of another kind, in its place, without what acts along it."""
+        place = [part.name for part in self.joints].index(name)
+        part = self.joints[place]
+        kept = {key: entry for key, entry in part.arguments.items() if key not in STRUCTURE}
+        self.joints[place] = Part(kind, kept | axes, part.where)
+        for group in (self.forces, self.constraints):
+            for part in [part for part in group if name in acts_along(part)]:
+                reason = f"{part.name!r} is along joint {name!r}, which is a {kind.__name__} in {where.path.name}"
+                self.leave_out(part.where, "joint", reason, False)
+            group[:] = [part for part in group if name not in acts_along(part)]
+
     def force(self, kind: type, name: str, where: Where, **arguments: Any) -> None:
         """Add a force element."""
         self._add(self.forces, kind, {"name": name, **arguments}, where)
@@ -204,8 +215,6 @@ class Draft:
             self.leave_out(where, "limit", f"its range from {lower:g} to {upper:g} is empty", False)
             return
         ends = {end: value for end, value in (("lower", lower), ("upper", upper)) if value is not None}
-        if ends.get("lower", 0.0) > 0.0 or ends.get("upper", 0.0) < 0.0:
-            self.outside.append(name)
         law = {"stiffness": stiffness, "exponent": 1.0, "damping": damping}
         self.force(JointLimit, f"{name}.limit", where, joint=joint, law=Part(ContactLaw, law, where), **ends)
 
@@ -319,9 +328,11 @@ class Draft:
         )
 
     def _warn(self):
-        if self.outside:
+        ends = {part.name.removesuffix(".limit"): part.arguments for part in self.forces if part.kind is JointLimit}
+        outside = [name for name, of in ends.items() if of.get("lower", 0.0) > 0.0 or of.get("upper", 0.0) < 0.0]
+        if outside:
             warn(
-                f"{self.path.name}: {', '.join(map(repr, self.outside))} are drawn outside of their ranges, and stops "
+                f"{self.path.name}: {', '.join(map(repr, outside))} are drawn outside of their ranges, and stops "
                 'push them from there; begin at other positions, or leave stops out by ignore=["contact", "limit"]',
                 LeftOutWarning,
             )

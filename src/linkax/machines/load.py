@@ -68,7 +68,8 @@ def load(
     - `base`: "free" or "fixed": how the first body of what nothing joins to the ground moves. By default "free" in
       SDF and USD, "fixed" in URDF and MJCF.
     - `closures`: for URDF, a YAML file of pairs of links that coincide: `closed_loop: [[a, b], ...]`, with
-      `type: [3d, ...]` for points, or 6d.
+      `type: [3d, ...]` for points, or 6d; and of joints that are of another type than URDF has: `joint_name: [a, ...]`
+      with `joint_type: [SPHERICAL, FIXED, UJOINT_XY, ...]`, the last about x, then y of its frame.
     - `folders`: further ones below which files may be read. `package://robot/...` and `model://robot/...`, as addresses
       of meshes, are in a folder `robot` there, or in one there that lies in `robot`.
     - `whole_angles`: take angles that are rounded multiples of 15 degrees, such as 1.5708 or 1.57 for π/2, as what they

@@ -4,6 +4,7 @@ The format: http://wiki.ros.org/urdf/XML. <loop> and <coupling> are of URDF+ (Ch
 Enhanced URDF for Robots with Kinematic Loops, 2024); <constraint> is that proposed for urdfdom (pull request 264).
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from linkax.machines.draft import Draft, Pose
 from linkax.machines.parts import Place
 from linkax.machines.poses import from_angles, pose, turned
 from linkax.machines.visuals import read_visual
-from linkax.machines.xml import MachineFileError, Node, library, read_file
+from linkax.machines.xml import MachineFileError, Node, Where, library, read_file
 from linkax.model.constraints.constraint import Coupling
 from linkax.model.joints.cylindrical import Cylindrical
 from linkax.model.joints.fixed import Fixed
@@ -24,6 +25,7 @@ from linkax.model.joints.prismatic import Prismatic
 from linkax.model.joints.revolute import Revolute
 from linkax.model.joints.spherical import Spherical
 from linkax.model.joints.universal import Universal
+from linkax.model.names import meant
 
 KINDS = {
     "revolute": Revolute, "continuous": Revolute, "prismatic": Prismatic, "fixed": Fixed, "floating": Free,
@@ -34,7 +36,14 @@ GRAVITY = (0.0, 0.0, -9.81)  # of which the format says nothing
 READ = ("link", "joint", "material", "loop", "constraint", "coupling")
 SEEN_ONLY = ("gazebo", "transmission", "sensor", "mujoco")
 ZERO = (0.0, 0.0, 0.0)
-OF_YAML = {"3d": Spherical, "6d": Fixed}
+LOOPS_OF_YAML = {"3d": Spherical, "6d": Fixed}
+OF_YAML = {  # what is known in a YAML file, and how to give it
+    "closed_loop": "closed_loop: [[link, link], ...] and type: [3d, ...]",
+    "type": "type: [3d, ...]",
+    "joint_name": "joint_name: [joint, ...] and joint_type: [SPHERICAL, ...]",
+    "joint_type": "joint_type: [SPHERICAL, ...]",
+    "name_mot": "name_mot: [joint, ...]",
+}
 
 
 def read_urdf(root: Node, draft: Draft) -> None:
@@ -222,7 +231,10 @@ class _Robot:
 
 
 def close_by_yaml(draft: Draft, path: Path) -> None:
-    """Close loops between links as a YAML file says: `closed_loop`, pairs of links, and `type`, "3d" or "6d" for each.
+    """Close loops as a YAML file says, whose keys are those of Gepetto's example-parallel-robots.
+
+    `closed_loop` has pairs of links that coincide, and `type` "3d" or "6d" for each. `joint_name` has joints of another
+    type than in URDF, and `joint_type` for each SPHERICAL, FIXED, or UJOINT_XY: about x of its frame, then y.
 
     **Raises:** `MachineFileError` without PyYAML, and for a file that says it otherwise.
     """
@@ -231,20 +243,51 @@ def close_by_yaml(draft: Draft, path: Path) -> None:
         given = yaml.safe_load(read_file(path))
     except (yaml.YAMLError, RecursionError) as error:
         raise MachineFileError(f"{path.name}: no YAML, {' '.join(str(error).split())}; mend the file there") from error
-    pairs = given.get("closed_loop", []) if isinstance(given, Mapping) else None
-    kinds = given.get("type", ["6d"] * len(pairs)) if isinstance(pairs, list) else None
-    if not isinstance(pairs, list) or not isinstance(kinds, list) or len(kinds) != len(pairs):
-        raise MachineFileError(
-            f"{path.name}: give closed_loop: [[link, link], ...] and as many words in type: [3d, ...]"
-        )
-    where = draft.bodies[0].where._replace(path=path, line=1, tag="closed_loop", name="")
-    for index, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
+    at = lambda key: Where(path, 1, key, "")
+    if not isinstance(given, Mapping):
+        raise at("closed_loop").error(f"the file has no closed_loop; give {OF_YAML['closed_loop']}")
+    for key in map(str, given):
+        if key not in OF_YAML:
+            draft.leave_out(at(key), key, f"it is not known{meant(key, OF_YAML)}; known: {', '.join(OF_YAML)}")
+    if "name_mot" in given:
+        draft.leave_out(at("name_mot"), "name_mot", "which joints have motors; give them torques or drives", False)
+    joints = [part.name for part in draft.joints]
+    for name, word in _pairs(given, "joint_name", "joint_type", at("joint_name")):
+        kind, axes = _kind_of_yaml(str(word), at("joint_type"))
+        if str(name) in joints:
+            draft.retype(str(name), kind, at("joint_type"), **axes)
+        else:
+            reason = f"{str(name)!r} is no joint of {draft.path.name}{meant(str(name), joints)}"
+            draft.leave_out(at("joint_name"), "joint_name", reason)
+    where = at("closed_loop")
+    for index, (pair, word) in enumerate(_pairs(given, "closed_loop", "type", where, "6d")):
         if not (isinstance(pair, list) and len(pair) == 2 and all(map(draft.poses.__contains__, map(str, pair)))):
             raise where.error(f"{pair!r} are not two links of {draft.path.name}")
-        if str(kind).lower() not in OF_YAML:
-            raise where.error(f"type {kind!r} of {pair!r} is not known; known: {', '.join(OF_YAML)}")
+        if str(word).lower() not in LOOPS_OF_YAML:
+            raise where.error(f"type {word!r} of {pair!r} is not known; known: {', '.join(LOOPS_OF_YAML)}")
         first, second = (Place.at(str(link), np.eye(4)) for link in pair)
-        draft.joint_at(OF_YAML[str(kind).lower()], f"closed_loop[{index}]", first, second, where, cut=True)
+        kind = LOOPS_OF_YAML[str(word).lower()]
+        draft.joint_at(kind, f"closed_loop[{index}]", first, second, where, cut=True)
+
+
+def _pairs(given: Mapping, first: str, second: str, where: Where, usual: str | None = None) -> list[tuple[Any, Any]]:
+    """What two lists of the same length say; the second may be absent where there is a usual word."""
+    entries = given.get(first, [])
+    words = given.get(second, [usual] * len(entries) if usual and isinstance(entries, list) else [])
+    if not isinstance(entries, list) or not isinstance(words, list) or len(words) != len(entries):
+        raise where.error(f"it and {second} must be lists of the same length; give {OF_YAML[first]}")
+    return list(zip(entries, words, strict=True))
+
+
+def _kind_of_yaml(word: str, where: Where) -> tuple[type, dict[str, Any]]:
+    """The class of a joint, and its axes in its frame."""
+    if found := re.fullmatch(r"UJOINT_([XYZ])([XYZ])", word):
+        first, second = found.groups()
+        if first != second:
+            return Universal, {"axis": np.eye(3)["XYZ".index(first)], "second_axis": np.eye(3)["XYZ".index(second)]}
+    elif word in ("SPHERICAL", "FIXED"):
+        return (Spherical if word == "SPHERICAL" else Fixed), {}
+    raise where.error(f"joint_type {word!r} is not known; known: SPHERICAL, FIXED, UJOINT_XY and its like")
 
 
 def _axes(node: Node, kind: type, given: Mapping[str, Node | None]) -> dict[str, Any]:
