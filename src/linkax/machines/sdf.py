@@ -177,7 +177,7 @@ class _Model:
     def _settings(self, node: Node) -> None:
         """Note what is set for a link or the model, and linkax does not model."""
         for tag, (kind, reason) in SETTINGS.items():
-            if _is_true(given := node.find(tag)):
+            if (given := node.find(tag)) is not None and _is_true(given):
                 self.draft.leave_out(given.where, kind, reason)
 
     def _visual(self, link: Node, node: Node) -> None:
@@ -337,14 +337,14 @@ class _Model:
         if axis not in AXES:
             raise mimic.where.error(f"axis is {axis!r}; known: {', '.join(AXES)}")
         factor, reference = mimic.number("multiplier", 1.0), mimic.number("reference", 0.0)
-        terms = [self._coordinate(node, index), self._coordinate(self.nodes[leader], AXES.index(axis))]
-        if None in terms:
-            self.draft.leave_out(
-                mimic.where, "mimic", f"linkax has no coordinate about {AXES[index]}, or {axis} of {leader!r}"
-            )
+        follower, ahead = self._coordinate(node, index), self._coordinate(self.nodes[leader], AXES.index(axis))
+        if follower is None or ahead is None:
+            reason = f"linkax has no coordinate about {AXES[index]}, or {axis} of {leader!r}"
+            self.draft.leave_out(mimic.where, "mimic", reason)
             return
         name = f"{self.prefix}{node.name}.mimic" + ("" if index == 0 else ".2")
-        self.draft.follow(name, mimic.where, *terms, factor, mimic.number("offset", 0.0) - factor * reference)
+        offset = mimic.number("offset", 0.0) - factor * reference
+        self.draft.follow(name, mimic.where, follower, ahead, factor, offset)
 
     def _coordinate(self, joint: Node, index: int) -> str | tuple[str, int] | None:
         """What linkax calls the coordinate along an axis of a joint; None where it has none there."""

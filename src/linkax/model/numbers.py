@@ -70,7 +70,7 @@ def number(entry: Any, shape: tuple[int, ...], what: str) -> Float[Array, "..."]
     return require(array, is_finite, what, "it must be finite")
 
 
-def number_in(text: str, kind: type[float] = float) -> float:
+def number_in(text: str, kind: type[int] | type[float] = float) -> float:
     """Read a number that a file or a command line gives: in ASCII digits, without the underscores that Python takes.
 
     **Raises:** `ValueError` for what is no number, or none of that kind.

@@ -130,7 +130,7 @@ def described(name: str, **functions: Any) -> Scene:
 
 
 def _count(entry: Any) -> int:
-    count = number_in(entry, int) if isinstance(entry, str) else operator.index(entry)
+    count = int(number_in(entry, int)) if isinstance(entry, str) else operator.index(entry)
     if isinstance(entry, bool) or count < 1:
         raise ValueError
     return count
