@@ -153,6 +153,19 @@ def test_a_mimic_and_a_coupling_relate_joints(tmp_path):
     assert found["gear"]["coefficients"] == {"crank_bearing": 3.0, "wheel_bearing": 1.0}
 
 
+def test_a_rotation_is_given_by_angles_or_by_a_quaternion(tmp_path):
+    """R_z(yaw) R_y(pitch) R_x(roll), or x, y, z and w of a quaternion."""
+    half, quarter = np.sin(np.pi / 4.0), np.pi / 2.0
+    given = '<link name="{0}"/><joint name="{0}" type="fixed"><parent link="frame"/><child link="{0}"/>{1}</joint>'
+    angles = given.format("angles", f'<origin rpy="{quarter} 0 {quarter}"/>')
+    quaternion = given.format("quaternion", f'<origin quat_xyzw="0 0 {half} {half}"/>')
+    placed = {part.name: part.arguments["parent"].rotation for part in load(tmp_path, angles + quaternion).joints}
+    assert np.allclose(placed["angles"], [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], atol=1e-15)
+    assert np.allclose(placed["quaternion"], [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], atol=1e-15)
+    with pytest.raises(lx.MachineFileError, match="origin: quat_xyzw is zero, or beside rpy; give one rotation"):
+        load(tmp_path, given.format("both", '<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>'))
+
+
 def test_a_loop_may_bear_the_name_of_a_joint(tmp_path):
     machine = load(tmp_path, CLOSED["loop"].replace("rocker_pin", "crank_pin"))
     assert [part.name for part in machine.joints if "crank_pin" in part.name] == ["crank_pin", "crank_pin.loop"]

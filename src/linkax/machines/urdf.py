@@ -13,7 +13,7 @@ import numpy as np
 
 from linkax.machines.draft import Draft, Pose
 from linkax.machines.parts import Place
-from linkax.machines.poses import from_angles, pose, turned
+from linkax.machines.poses import from_angles, from_quaternion, pose, turned
 from linkax.machines.visuals import read_visual
 from linkax.machines.xml import MachineFileError, Node, Where, library, read_file
 from linkax.model.constraints.constraint import Coupling
@@ -116,9 +116,14 @@ class _Robot:
         return found
 
     def _origin(self, node: Node | None) -> Pose:
-        """The pose in an <origin>."""
+        """The pose in an <origin>, whose rotation URDF 1.1 may give as a quaternion, too."""
         if node is None:
             return np.eye(4)
+        if node.get("quat_xyzw"):
+            turn = node.numbers("quat_xyzw", 4)
+            if node.get("rpy") or not np.any(turn):
+                raise node.where.error("quat_xyzw is zero, or beside rpy; give one rotation")
+            return pose(node.numbers("xyz", 3, ZERO), from_quaternion(turn[[3, 0, 1, 2]]))
         return pose(node.numbers("xyz", 3, ZERO), from_angles(self.draft.angles(node.numbers("rpy", 3, ZERO))))
 
     def _body(self, node: Node) -> None:
