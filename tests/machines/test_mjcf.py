@@ -306,6 +306,24 @@ def test_equalities_hold_in_mujoco_where_loops_are_closed():
     assert np.abs(data.efc_pos[: data.nefc][held]).max() < 1e-9
 
 
+def test_a_polynomial_is_of_coordinates_from_where_the_machine_is_drawn(tmp_path):
+    """y − y₀ = a₀ + a₁ (x − x₀) + … + a₄ (x − x₀)⁴, with x₀ and y₀ the `ref` of both joints."""
+    joint = '<body name="{0}"><joint name="{0}" axis="0 1 0" ref="{1}"/><geom size="0.1" pos="1 0 0"/></body>'
+    bodies = joint.format("y", 30) + joint.format("x", -20)
+    text = f"""<mujoco><option><flag contact="disable"/></option><worldbody>{bodies}</worldbody>
+      <equality><joint joint1="y" joint2="x" polycoef="0.1 0.5 0.2 -0.3 0.05"/></equality></mujoco>"""
+    (tmp_path / "cam.xml").write_text(text)
+    mechanism = lx.load(tmp_path / "cam.xml").mechanism()
+    state, model = lx.assemble(mechanism, {"x": 0.7}), compiled(text)
+    data = mujoco.MjData(model)
+    data.qpos = positions(model, mechanism, ["y", "x"], state.q)
+    mujoco.mj_forward(model, data)
+    assert np.abs(data.efc_pos[: data.nefc]).max() < 1e-12
+    here = lx.Solution.of_state(mechanism, state)
+    assert here.joint("x")[0] == pytest.approx(0.7)
+    assert here.joint("y")[0] == pytest.approx(np.polynomial.polynomial.polyval(0.7, [0.1, 0.5, 0.2, -0.3, 0.05]))
+
+
 def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "tree.xml").write_text(TREE)
     monkeypatch.setitem(sys.modules, "mujoco", None)

@@ -229,6 +229,15 @@ def test_a_broken_file_is_refused_by_name(tmp_path, name, capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_an_attribute_that_usd_does_not_know_is_told(tmp_path):
+    path = tmp_path / "misspelt.usda"
+    path.write_text(TEXT.replace("float physics:mass = 1.0", "float physics:mas = 1.0", 1))
+    told = [str(item) for item in lx.load(path).left_out if item.kind == "extension" and "mas " in item.reason]
+    assert len(told) == 1
+    assert ":21: " in told[0]
+    assert told[0].endswith("physics:mas is not in USD Physics (did you mean 'physics:mass'?)")
+
+
 def test_packages_and_references_are_read_in_the_folder_alone(tmp_path):
     (tmp_path / "inside.usda").write_text(TEXT)
     assert UsdUtils.CreateNewUsdzPackage(str(tmp_path / "inside.usda"), str(tmp_path / "machine.usdz"))

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from linkax.machines.draft import Draft, Pose
 from linkax.machines.poses import exact, from_quaternion, pose
 from linkax.machines.xml import MachineFileError, Where
+from linkax.model.names import meant
 
 AXES = "XYZ"
 OTHERS = ("physx", "newton", "mjc")  # beginnings of attributes of simulators, which USD Physics does not have
@@ -112,7 +113,7 @@ class Stage:
         return pose(matrix[:3, 3] * self.length, rotation), exact(rotation.T @ linear)
 
     def note_extensions(self, prim: Any, where: Where) -> None:
-        """Note what other simulators add to USD Physics."""
+        """Note what other simulators add to USD Physics, and attributes that it does not know."""
         for schema in prim.GetPrimTypeInfo().GetAppliedAPISchemas():
             if "Mimic" in schema or "Tendon" in schema:
                 self.draft.leave_out(where, "coupling", f"{schema}, which is not in USD Physics; take linkax.Coupling")
@@ -121,6 +122,12 @@ class Stage:
             for attribute in prim.GetAuthoredAttributes()
             if attribute.GetName().startswith(OTHERS) and attribute.GetName() != "physxRigidBody:disableGravity"
         ]
+        known = set(prim.GetPrimDefinition().GetPropertyNames())
+        given = [attribute.GetName() for attribute in prim.GetAuthoredPropertiesInNamespace("physics")]
+        for name in given:
+            if name not in known:
+                reason = f"{name} is not in USD Physics{meant(name, known - set(given))}"
+                self.draft.leave_out(where, "extension", reason, False)
         if named:
             reason = f"{', '.join(named[:3])}{', ...' * (len(named) > 3)}, which USD Physics does not have"
             self.draft.leave_out(where, "extension", reason, False)
