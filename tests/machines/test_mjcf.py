@@ -202,6 +202,22 @@ def test_a_control_of_zero_is_clamped_as_in_mujoco(tmp_path):
     assert [item.reason for item in machine.left_out] == ["controls you give are not clamped to 1 to 2"]
 
 
+def test_what_the_file_disables_is_not_there(tmp_path):
+    """All that MuJoCo computes as constraints: ranges, dry friction, equalities; actuators by groups."""
+    joint = 'range="-1 1" limited="true" frictionloss="2" damping="3"'
+    motors = '<motor name="off" joint="pin" group="2"/><motor name="on" joint="pin" group="1"/>'
+    machine = driven(tmp_path / "driven.xml", joint=joint, actuators=motors)
+    names = {"gravity", "pin.damper", "pin.limit", "pin.friction", "off", "on"}
+    assert {part.name for part in machine.forces} == names
+    option = '<option actuatorgroupdisable="2"><flag constraint="disable"/></option>'
+    held = '<equality><joint joint1="pin"/></equality>'
+    text = (tmp_path / "driven.xml").read_text().replace("<mujoco>", f"<mujoco>{option}{held}")
+    (tmp_path / "disabled.xml").write_text(text)
+    machine = lx.load(tmp_path / "disabled.xml")
+    assert {part.name for part in machine.forces} == names - {"pin.limit", "pin.friction", "off"}
+    assert machine.constraints == ()
+
+
 def test_pairs_in_contact_are_not_dropped_in_silence(tmp_path):
     geom = '<geom name="{0}" size="0.1" contype="0" conaffinity="0"/>'
     body = f'<body name="{{0}}"><joint name="{{0}}"/>{geom}</body>'
@@ -215,6 +231,10 @@ def test_pairs_in_contact_are_not_dropped_in_silence(tmp_path):
 LIMITED = {"joint": 'actuatorfrcrange="-3 5"'}
 TWO = motor("first", 'joint="pin"') + motor("second", 'joint="pin"')
 NEWER = [
+    (
+        {"actuators": '<pid name="pid" joint="pin" kp="3"/>' + motor("motor", 'joint="pin"')},
+        "an actuator that is not affine",
+    ),
     ({"actuators": motor("motor", 'joint="pin" damping="3"')}, "its own damping"),
     ({"actuators": motor("motor", 'joint="pin" armature="3"')}, "its own armature"),
     (LIMITED | {"actuators": TWO}, "the range of the force on its joint, on which others act"),

@@ -15,16 +15,20 @@ OWN = ("damping", "dampingpoly", "armature", "delay")  # of an actuator, in newe
 def read_actuators(compiled: Compiled) -> None:
     """Read all actuators, or note what they are."""
     model, draft = compiled.model, compiled.draft
-    targets = [_target(compiled, index) for index in range(model.nu)]
-    for index, (name, target) in enumerate(zip(compiled.names("actuator"), targets, strict=True)):
-        where = compiled.where("actuator", index)
+    names = compiled.names("actuator")
+    targets = [_target(compiled, index) for index in range(len(names))]
+    for index, (name, target) in enumerate(zip(names, targets, strict=True)):
+        where, group = compiled.where("actuator", index), int(model.actuator_group[index])
+        if group >= 0 and model.opt.disableactuator >> group & 1:
+            draft.leave_out(where, "actuator", f"its group {group} is disabled", False)
+            continue
         if draft.ignores("actuator", where, "the actuator"):
             continue
         terms = _terms(compiled, index, target, where)
         law = _law(compiled, index, terms or {})
         if terms and law is not None:
             for own in OWN:
-                if np.any(getattr(model, f"actuator_{own}", np.zeros(model.nu))[index]):
+                if np.any(getattr(model, f"actuator_{own}", np.zeros(len(names)))[index]):
                     draft.leave_out(where, "actuator", f"its own {own}")
             law |= _range(compiled, index, target, targets.count(target) == 1, [*terms], where)
             draft.force(

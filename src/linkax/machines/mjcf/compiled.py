@@ -10,6 +10,8 @@ from linkax.machines.xml import Where
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.names import free_name
 
+OF_CONSTRAINTS = ("EQUALITY", "FRICTIONLOSS", "LIMIT", "CONTACT")
+
 
 class Compiled:
     """A model that MuJoCo has compiled, to be read into a draft.
@@ -30,8 +32,11 @@ class Compiled:
         self.joint_names = self.names("joint", stems)
 
     def has(self, what: str) -> bool:
-        """Whether a kind of force is not disabled by a <flag>."""
-        return not self.model.opt.disableflags & int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{what}"))
+        """Whether a kind of force is not disabled by a <flag>, nor all that MuJoCo computes as constraints."""
+        kinds = (what, "CONSTRAINT") if what in OF_CONSTRAINTS else (what,)
+        return not any(
+            self.model.opt.disableflags & int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{kind}")) for kind in kinds
+        )
 
     def elements(self, kind: str) -> dict[int, Any]:
         """The elements of a kind as the file has them, by their index in the model."""
