@@ -212,6 +212,12 @@ WRONG = (
         "mimic: it follows 'end1', of type 'fixed', without one coord",
     ),
     (TURNS.replace("revolute", "universal").format("<axis/>"), "joint 'turns': a universal joint needs two axes"),
+    ('<gazebo reference="crank"><turnGravityOff>true</turnGravityOff></gazebo>', "<gazebo> has <turnGravityOff>"),
+    ("<gazebo><joint/></gazebo>", r'gazebo: <gazebo> has <joint>[\s\S]*ignore=\["gazebo"\]'),
+    (
+        '<link name="a"><inertial><mass value="1"/><inertia ixx="1" izz="1"/></inertial></link>',
+        "inertia: it has no iyy; give",
+    ),
     ("<drake:ball_constraint/>", r'ignore=\["drake:ball_constraint"\]'),
     ('<link name="crank"/>', "twice"),
 )
@@ -232,8 +238,12 @@ def test_joints_that_follow_each_other_in_a_ring_are_refused(tmp_path):
 def test_what_no_reader_asks_for_is_told(tmp_path):
     """Elements and attributes that are not known, each with the element that they are in, and no more of them."""
     given = '<limit lower="-1" upper="1" effort="9" velocity="1"/><calibration rising="0"/><calibration rising="1"/>'
-    machine = load(tmp_path, TURNS.format(given), more="<velocity/>")
+    plain = (
+        '<gazebo reference="crank"><turnGravityOff>false</turnGravityOff></gazebo><transmission><joint/></transmission>'
+    )
+    machine = load(tmp_path, TURNS.format(given) + plain, more="<velocity/>")
     assert [str(item) for item in machine.left_out] == [
+        *(f"four_bar.urdf:15: {tag}: <{tag}> does not move anything" for tag in ("gazebo", "transmission")),
         "four_bar.urdf:4: joint 'crank_bearing': <velocity> in it: not read",
         "four_bar.urdf:15: limit: effort, velocity in it: not read",
         "four_bar.urdf:15: joint 'turns': <calibration> in it: not read",

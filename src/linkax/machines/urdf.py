@@ -35,6 +35,10 @@ WITH_AXIS = (Revolute, Prismatic, Planar, Cylindrical)
 GRAVITY = (0.0, 0.0, -9.81)  # of which the format says nothing
 READ = ("link", "joint", "material", "loop", "constraint", "coupling")
 SEEN_ONLY = ("gazebo", "transmission", "sensor", "mujoco")
+MOVING = {  # in a <gazebo>, what moves a machine, with texts that say that it does not
+    "joint": (), "link": (), "gravity": ("true", "1"), "turnGravityOff": ("false", "0"),
+    "springStiffness": ("0", "0.0"), "dampingFactor": ("0", "0.0"),
+}  # fmt: skip
 ZERO = (0.0, 0.0, 0.0)
 LOOPS_OF_YAML = {"3d": Spherical, "6d": Fixed}
 OF_YAML = {  # what is known in a YAML file, and how to give it
@@ -90,9 +94,11 @@ class _Robot:
                 self._coupling(node)
         for node in root:
             if node.tag not in READ:
-                known = node.tag in SEEN_ONLY
-                reason = f"<{node.tag}> does not move anything" if known else f"<{node.tag}> is not known"
-                draft.leave_out(node.where, node.tag, reason, not known)
+                given = [(child.tag, child.text.strip().lower()) for child in node if node.tag == "gazebo"]
+                moving = [tag for tag, text in given if tag in MOVING and text not in MOVING[tag]]
+                known = node.tag in SEEN_ONLY and not moving
+                reason = "does not move anything" if known else f"has <{moving[0]}>" if moving else "is not known"
+                draft.leave_out(node.where, node.tag, f"<{node.tag}> {reason}", not known)
 
     def _link(self, node: Node, tag: str) -> str:
         """The name of the link at one end."""
@@ -131,8 +137,9 @@ class _Robot:
         mass, at, inertia = 0.0, np.eye(4), np.zeros((3, 3))
         if inertial is not None:
             at, mass = self._origin(inertial.find("origin")), float(inertial.child("mass").numbers("value", 1)[0])
-            entry = lambda name: float(inertial.child("inertia").numbers(name, 1, [0.0])[0])
-            xx, yy, zz, xy, xz, yz = map(entry, ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+            entry = lambda name, *default: float(inertial.child("inertia").numbers(name, 1, *default)[0])
+            xx, yy, zz = map(entry, ("ixx", "iyy", "izz"))
+            xy, xz, yz = (entry(name, [0.0]) for name in ("ixy", "ixz", "iyz"))
             inertia = turned(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), at[:3, :3])
         self.draft.body(node.name, self._pose_of(node.name), mass, at[:3, 3], inertia, node.where)
         for child in node.all("collision"):
