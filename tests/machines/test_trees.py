@@ -186,3 +186,60 @@ def test_a_tree_of_urdf_is_that_of_mujoco(tmp_path):
     mechanism = lx.load(tmp_path / "tree.urdf", ignore=["limit"]).mechanism()
     assert model.nv == mechanism.topology.num_speeds == 9
     assert worst_difference(mechanism, model) < 1e-10
+
+
+BODY = """def Xform "{0}" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"])
+  {{
+    float physics:mass = 1
+    float3 physics:diagonalInertia = (1, 1, 1)
+    point3f physics:centerOfMass = (0, 0, 0)
+  }}
+"""
+PIN = """def PhysicsRevoluteJoint "pin"
+  {
+    rel physics:body0 = </ground>
+    rel physics:body1 = </arm>
+  }
+"""
+GEOM = '<geom size="1" contype="0" conaffinity="0"/>'
+GROUNDS = {
+    "urdf": f"""<robot name="r">{LINK.format("ground")}{LINK.format("arm")}
+      <joint name="pin" type="continuous"><parent link="ground"/><child link="arm"/></joint></robot>""",
+    "sdf": f"""<sdf version="1.9"><model name="m">{SDF_LINK.format("ground", "")}{SDF_LINK.format("arm", "")}
+      {SDF_JOINT.format("pin", "revolute", "ground", "arm")}</model></sdf>""",
+    "xml": f"""<mujoco><worldbody><body name="ground"><freejoint/>{GEOM}
+      <body name="arm"><joint name="pin"/>{GEOM}</body></body></worldbody></mujoco>""",
+    "usda": f"#usda 1.0\n{BODY.format('ground')}{BODY.format('arm')}{PIN}",
+}
+
+
+@pytest.mark.parametrize("suffix", GROUNDS)
+def test_a_body_of_a_file_may_be_named_ground(tmp_path, suffix):
+    """It is another one than what stands still, and called so."""
+    path = tmp_path / f"ground.{suffix}"
+    path.write_text(GROUNDS[suffix])
+    machine = lx.load(path, base="free")
+    assert [part.name for part in machine.bodies] == ["ground.body", "arm"]
+    pin = next(part.arguments for part in machine.joints if part.name == "pin")
+    assert (pin["parent"].body, pin["child"].body) == ("ground.body", "arm")
+    assert [item.kind for item in machine.left_out] == ["name"]
+    assert machine.mechanism().topology.joints
+
+
+@pytest.mark.parametrize(
+    ("moments", "possible"),
+    [((-1.0, 2.0, 3.0), (0.0, 2.0, 2.0)), ((1.0, 2.0, 4.0), (1.0, 2.0, 3.0)), ((-1e-16, 1.0, 1.0), (-1e-16, 1.0, 1.0))],
+)
+def test_an_inertia_that_no_body_has_is_the_nearest_where_that_is_asked_for(tmp_path, moments, possible):
+    """Principal moments are not negative, and none exceeds the sum of the others, but for rounding."""
+    given = " ".join(f'{name}="{moment}"' for name, moment in zip(("ixx", "iyy", "izz"), moments, strict=True))
+    inertial = f'<inertial><mass value="1"/><inertia {given}/></inertial>'
+    (tmp_path / "one.urdf").write_text(f'<robot name="r"><link name="one">{inertial}</link></robot>')
+    if moments != possible:
+        with pytest.raises(lx.MachineFileError, match=r'principal moments .* negative, or[\s\S]*ignore=\["inertia"\]'):
+            lx.load(tmp_path / "one.urdf")
+        with pytest.warns(lx.LeftOutWarning, match="taken as"):
+            machine = lx.load(tmp_path / "one.urdf", ignore=["inertia"])
+    else:
+        machine = lx.load(tmp_path / "one.urdf")
+    assert np.allclose(machine.bodies[0].arguments["inertia"], np.diag(possible), atol=1e-15)

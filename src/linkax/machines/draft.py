@@ -29,7 +29,9 @@ Pose = Float[np.ndarray, "4 4"]
 STOP_DEPTH = 1e-3  # how far the weight of a machine presses a stop whose stiffness no file gives [rad or of its size]
 STOP_RESTITUTION = 0.1  # of such a stop, hit with 1 rad/s, or one size a second
 FRICTION_SPEED = 1e-2  # below which dry friction along a joint is nearly viscous [rad/s, or of the size a second]
+ROUNDING = 5e-10  # of the largest principal moment, by which others may be impossible
 KINDS = ("contact", "limit", "spring", "damping", "friction", "actuator", "inertia", "joint", "equality", "tendon")
+OF_GROUND = f"{GROUND_NAME}.body"
 SHOWN = 4  # things left out that a warning names
 
 
@@ -90,23 +92,26 @@ class Draft:
         where: Where,
         frames: dict[str, Any] | None = None,
     ) -> None:
-        """Add a body, from its pose in the world as drawn, and its numbers in its own frame."""
+        """Add a body, named by `body_name`, from its pose in the world as drawn, and its numbers in its own frame."""
         if name in self.poses:
             raise where.error(f"body {name!r} is there twice; give each a name of its own")
+        if name == OF_GROUND:
+            self.leave_out(where, "name", f"it is {name!r} here, since {GROUND_NAME!r} is what stands still", False)
         self.poses[name] = pose
         inertia = self._possible(inertia, where)
         arguments = {"name": name, "mass": float(mass), "center_of_mass": center_of_mass, "inertia": inertia}
         self._add(self.bodies, RigidBody, arguments | ({"frames": frames} if frames else {}), where)
 
     def _possible(self, inertia, where):
-        """The inertia, with a largest moment no larger than the sum of the others, as every body has it."""
+        """The inertia, with moments that are not negative, and a largest one no larger than the sum of the others."""
         moments, axes = np.linalg.eigh(inertia)
-        most = moments[0] + moments[1]
-        if moments[0] < 0.0 or moments[2] <= most * (1.0 + 1e-9) + 1e-12 * moments[2]:
+        possible = np.maximum(moments, 0.0)
+        possible[2] = min(possible[2], possible[0] + possible[1])
+        if np.abs(moments - possible).max() <= ROUNDING * np.abs(moments).max():
             return inertia
-        reason = f"of its principal moments {moments} kg m² the largest exceeds the sum of the others; reduced to that"
-        self.leave_out(where, "inertia", reason)
-        return turned(np.diag([moments[0], moments[1], most]), axes)
+        reason = f"no body has its principal moments {moments} kg m², negative, or one above the sum of the others"
+        self.leave_out(where, "inertia", f"{reason}; taken as {possible}")
+        return turned(np.diag(possible), axes)
 
     def shape(self, body: str, kind: Any, size: Any, at: Pose, mesh: Path | None = None, colour: Any = None) -> None:
         """Add what a body is drawn as, from its pose on the body; what is not opaque at all is not seen.
@@ -342,6 +347,11 @@ class Draft:
         more = len(self.left_out) - len(ignored[:SHOWN])
         rest = f"; {more} more in machine.left_out" if more else ""
         warn(f"{self.path.name}: left out {'; '.join(map(str, ignored[:SHOWN]))}{rest}", LeftOutWarning)
+
+
+def body_name(name: str) -> str:
+    """What a body of a file is called, whose name may be that of what stands still."""
+    return OF_GROUND if name == GROUND_NAME else name
 
 
 class LeftOutWarning(UserWarning):

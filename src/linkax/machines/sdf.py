@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from linkax.machines.draft import Draft, Pose
+from linkax.machines.draft import Draft, Pose, body_name
 from linkax.machines.poses import from_angles, from_quaternion, inverse, pose, relative, turned
 from linkax.machines.visuals import read_visual
 from linkax.machines.xml import Node, Where, read_numbers
@@ -106,7 +106,7 @@ class _Model:
             for name in self.links:
                 where = self.nodes[name].where
                 self.draft.joint(
-                    Fixed, f"{self.prefix}{name}.static", GROUND_NAME, self.prefix + name, self.pose_of(name), where
+                    Fixed, f"{self.prefix}{name}.static", GROUND_NAME, self._called(name), self.pose_of(name), where
                 )
         gearboxes = [node for node in self.node.all("joint") if node.attribute("type") == "gearbox"]
         for node in self.node.all("joint"):
@@ -145,6 +145,10 @@ class _Model:
             return _end_of(node, "child")
         return node.get("attached_to") if node.tag == "frame" else ""
 
+    def _called(self, link: str) -> str:
+        """What linkax calls a link, or the world."""
+        return GROUND_NAME if link == WORLD else body_name(self.prefix + link)
+
     def _known(self) -> str:
         names = list(self.nodes)
         return ", ".join(map(repr, names[:8])) + (", ..." if len(names) > 8 else "")
@@ -163,9 +167,9 @@ class _Model:
         xx, yy, zz = (entry(name, 1.0) for name in ("ixx", "iyy", "izz"))
         xy, xz, yz = (entry(name, 0.0) for name in ("ixy", "ixz", "iyz"))
         inertia = turned(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), at[:3, :3])
-        draft.body(self.prefix + node.name, self.pose_of(node.name), mass, at[:3, 3], inertia, where)
+        draft.body(self._called(node.name), self.pose_of(node.name), mass, at[:3, 3], inertia, where)
         if not _is_true(node.find("gravity"), True):
-            draft.carry(self.prefix + node.name, at[:3, 3], -mass * self.gravity, where)
+            draft.carry(self._called(node.name), at[:3, 3], -mass * self.gravity, where)
         for child in node.all("collision"):
             draft.leave_out(child.where, "contact", "contact of this shape with others")
         for child in node.all("visual"):
@@ -191,7 +195,7 @@ class _Model:
             colour = _colour(max(colours, key=lambda each: each.tag)) if colours else None
             if colour is not None:
                 colour[3] *= 1.0 - node.number("transparency", 0.0)
-            read_visual(self.draft, self.prefix + link.name, node, at, colour)
+            read_visual(self.draft, self._called(link.name), node, at, colour)
         except ValueError as error:
             self.draft.leave_out(node.where, "visual", str(error), False)
 
@@ -238,8 +242,7 @@ class _Model:
         if KINDS[kind] is Screw:
             arguments["pitch"] = _pitch(node)
         name = self.prefix + node.name
-        body = lambda link: GROUND_NAME if link == WORLD else self.prefix + link
-        draft.joint(KINDS[kind], name, body(parent), body(child), frame, where, **arguments)
+        draft.joint(KINDS[kind], name, self._called(parent), self._called(child), frame, where, **arguments)
         for index, axis in enumerate(axes):
             if index >= len(KINDS[kind].speed_units) or KINDS[kind] is Spherical:
                 draft.leave_out(axis.where, "axis", f"a joint of type {kind!r} has no such axis", False)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from linkax.machines.draft import Draft, Pose
+from linkax.machines.draft import Draft, Pose, body_name
 from linkax.machines.parts import Place
 from linkax.machines.poses import from_angles, from_quaternion, pose, turned
 from linkax.machines.visuals import read_visual
@@ -34,7 +34,7 @@ KINDS = {
 WITH_AXIS = (Revolute, Prismatic, Planar, Cylindrical)
 GRAVITY = (0.0, 0.0, -9.81)  # of which the format says nothing
 READ = ("link", "joint", "material", "loop", "constraint", "coupling")
-SEEN_ONLY = ("gazebo", "transmission", "sensor", "mujoco")
+SEEN_ONLY = ("gazebo", "transmission", "sensor", "mujoco", "ros2_control")
 MOVING = {  # in a <gazebo>, what moves a machine, with texts that say that it does not
     "joint": (), "link": (), "gravity": ("true", "1"), "turnGravityOff": ("false", "0"),
     "springStiffness": ("0", "0.0"), "dampingFactor": ("0", "0.0"),
@@ -64,8 +64,10 @@ class _Robot:
 
     def __init__(self, root: Node, draft: Draft) -> None:
         self.root, self.draft = root, draft
-        self.links = {link.name: link for link in root.all("link")}
+        self.links = {body_name(link.name): link for link in root.all("link")}
         self.materials = {node.get("name"): node for node in root.all("material")}
+        for material in self.materials.values():
+            material.moves_nothing()
         self.joints: dict[str, Node] = {}
         self.carrier: dict[str, tuple[str, str]] = {}  # of a link: its parent in the tree of joints, and the joint
 
@@ -103,7 +105,7 @@ class _Robot:
     def _link(self, node: Node, tag: str) -> str:
         """The name of the link at one end."""
         given = node.child(tag)
-        name = given.get("link") or given.attribute("name")
+        name = body_name(given.get("link") or given.attribute("name"))
         if name not in self.links:
             raise given.where.error(f"{tag} is {name!r}, which is no link of the file")
         return name
@@ -141,11 +143,12 @@ class _Robot:
             xx, yy, zz = map(entry, ("ixx", "iyy", "izz"))
             xy, xz, yz = (entry(name, [0.0]) for name in ("ixy", "ixz", "iyz"))
             inertia = turned(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), at[:3, :3])
-        self.draft.body(node.name, self._pose_of(node.name), mass, at[:3, 3], inertia, node.where)
+        name = body_name(node.name)
+        self.draft.body(name, self._pose_of(name), mass, at[:3, 3], inertia, node.where)
         for child in node.all("collision"):
             self.draft.leave_out(child.where, "contact", "contact of this shape with others")
         for child in node.all("visual"):
-            self._visual(node.name, child)
+            self._visual(name, child)
 
     def _visual(self, link: str, node: Node) -> None:
         """A shape that is only seen; what is not kept of it is noted."""
@@ -184,14 +187,11 @@ class _Robot:
     def _mimic(self, node: Node, mimic: Node) -> None:
         """Its coordinate = multiplier × that of the leader + offset."""
         leader = mimic.attribute("joint")
-        if leader not in self.joints:
-            raise mimic.where.error(f"it follows {leader!r}, which is no joint of the file")
         factor, offset = (float(mimic.numbers(*given)[0]) for given in (("multiplier", 1, [1.0]), ("offset", 1, [0.0])))
-        kind = self.joints[leader].attribute("type")
-        if KINDS.get(kind) not in (Revolute, Prismatic):
-            self.draft.leave_out(
-                mimic.where, "mimic", f"it follows {leader!r}, of type {kind!r}, without one coordinate"
-            )
+        kind = self.joints[leader].attribute("type") if leader in self.joints else None
+        if KINDS.get(kind or "") not in (Revolute, Prismatic):
+            what = "which is no joint of the file" if kind is None else f"of type {kind!r}, without one coordinate"
+            self.draft.leave_out(mimic.where, "mimic", f"it follows {leader!r}, {what}")
             return
         self.draft.follow(f"{node.name}.mimic", mimic.where, node.name, leader, factor, offset)
 
@@ -273,11 +273,12 @@ def close_by_yaml(draft: Draft, path: Path) -> None:
             draft.leave_out(at("joint_name"), "joint_name", reason)
     where = at("closed_loop")
     for index, (pair, word) in enumerate(_pairs(given, "closed_loop", "type", where, "6d")):
-        if not (isinstance(pair, list) and len(pair) == 2 and all(map(draft.poses.__contains__, map(str, pair)))):
+        ends = [body_name(str(link)) for link in pair] if isinstance(pair, list) else []
+        if len(ends) != 2 or not all(map(draft.poses.__contains__, ends)):
             raise where.error(f"{pair!r} are not two links of {draft.path.name}")
         if str(word).lower() not in LOOPS_OF_YAML:
             raise where.error(f"type {word!r} of {pair!r} is not known; known: {', '.join(LOOPS_OF_YAML)}")
-        first, second = (Place.at(str(link), np.eye(4)) for link in pair)
+        first, second = (Place.at(end, np.eye(4)) for end in ends)
         kind = LOOPS_OF_YAML[str(word).lower()]
         draft.joint_at(kind, f"closed_loop[{index}]", first, second, where, cut=True)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from linkax.machines.draft import Draft
+from linkax.machines.draft import Draft, body_name
 from linkax.machines.xml import Where
 from linkax.model.bodies import GROUND_NAME
 from linkax.model.names import free_name
@@ -25,7 +25,7 @@ class Compiled:
         self.mujoco, self.model, self.draft = mujoco, model, draft
         self.spec, self._found = spec, dict[str, dict[int, Any]]()
         self.gravity = np.array(model.opt.gravity) * self.has("GRAVITY")
-        self.body_names = [GROUND_NAME, *self.names("body")[1:]]
+        self.body_names = [GROUND_NAME, *map(body_name, self.names("body")[1:])]
         self.joint_kinds = [mujoco.mjtJoint(int(kind)).name.removeprefix("mjJNT_").lower() for kind in model.jnt_type]
         bodies = [self.body_names[body] for body in model.jnt_bodyid]
         stems = [f"{body}.{kind}" for body, kind in zip(bodies, self.joint_kinds, strict=True)]
@@ -48,11 +48,10 @@ class Compiled:
     def names(self, kind: str, instead: Sequence[str] | None = None) -> list[str]:
         """Names by index; for what has none the one given instead, with a number where that is taken."""
         given, found = self.elements(kind), list[str]()
-        taken = {element.name for element in given.values()} | {GROUND_NAME}
+        taken = {element.name for element in given.values()}
         for index in range(len(given)):
-            name = given[index].name if given[index].name != GROUND_NAME else ""
             stem = kind if instead is None else instead[index]
-            found.append(name or free_name(stem, taken))
+            found.append(given[index].name or free_name(stem, taken))
             taken.add(found[-1])
         return found
 

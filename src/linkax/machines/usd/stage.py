@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from linkax.machines.draft import Draft, Pose
+from linkax.machines.draft import Draft, Pose, body_name
 from linkax.machines.poses import exact, from_quaternion, pose
 from linkax.machines.xml import MachineFileError, Where
 from linkax.model.names import meant
@@ -41,8 +41,9 @@ class Stage:
         self.prims = list(usd_stage.Traverse(self.usd.TraverseInstanceProxies()))
         names = Counter(prim.GetName() for prim in self.prims if self.moves(prim) or self.is_joint(prim))
         dotted = lambda prim: str(prim.GetPath())[1:].replace("/", ".")
+        unique = lambda prim: prim.GetName() if names[prim.GetName()] == 1 else dotted(prim)
         self.names = {
-            prim.GetPath(): prim.GetName() if names[prim.GetName()] == 1 else dotted(prim) for prim in self.prims
+            prim.GetPath(): body_name(unique(prim)) if self.moves(prim) else unique(prim) for prim in self.prims
         }
 
     def where(self, prim: Any) -> Where:
