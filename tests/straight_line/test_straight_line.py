@@ -47,6 +47,12 @@ def test_random_programs(seeds, dtype):
         assert_same(jax.jit(straight_line(program))(*given), jax.jit(program)(*given))
 
 
+def test_nothing_is_compiled_where_jax_may_not():
+    with jax.disable_jit():
+        found = straight_line(lambda x: jnp.sin(x) * np.asarray(x))(jnp.arange(3.0))  # NumPy's takes no tracers
+    np.testing.assert_allclose(found, np.sin(np.arange(3.0)) * np.arange(3.0), rtol=1e-15)
+
+
 def loss(function):
     """A number of the real results, with derivatives."""
 

@@ -19,7 +19,7 @@ from linkax.straight_line.kernel import Scalars, kernels_of
 from linkax.straight_line.known import patterns_of
 from linkax.straight_line.program import Pattern, Program, straighten
 from linkax.xla.flags import makes_kernels_of_loops
-from linkax.xla.tracing import all_concrete, evaluate_now
+from linkax.xla.tracing import all_concrete, evaluate_now, is_compiled
 from linkax.xla.users_line import warn
 
 Output = TypeVar("Output")
@@ -43,7 +43,8 @@ def straight_line(function: Callable[..., Output], most: int = MOST_OPERATIONS) 
 
     @wraps(function)
     def straight(*args):
-        if not computes_kernels():
+        # Operation by operation where nothing is to be compiled, as for debugging.
+        if not (is_compiled() and computes_kernels()):
             return function(*args)
         dynamic, static = eqx.partition(args, eqx.is_array)
         leaves, tree = jax.tree.flatten(dynamic)
