@@ -1,7 +1,11 @@
 """Functions compared by what they compute: the same made anew, others where anything that they read is another."""
 
+import collections
+import dataclasses
 import functools
 import math
+import os
+import threading
 import types
 
 import equinox as eqx
@@ -10,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import linkax as lx
 from linkax.model.code import Code
 
 SPEED, TABLE, NUMBERS = 2.0, {"speed": [2.0, 3.0]}, np.arange(3.0)
@@ -84,6 +89,16 @@ def counting():
     return law
 
 
+@dataclasses.dataclass(slots=True)
+class Slots:
+    speed: float
+
+
+class Other(dict):
+    def __getattr__(self, name):
+        return self[name]
+
+
 MADE = {
     "no variables": lambda: lambda t: 2.0 * jnp.sin(math.pi * t),
     "a number": lambda: scaled(2.0),
@@ -101,6 +116,12 @@ MADE = {
     "a method of a pytree": lambda: Wave(jnp.array(2.0)).doubled,
     "a pytree": lambda: Wave(jnp.array(2.0), lambda t: t**2),
     "a function of JAX": lambda: jnp.sin,
+    "a function made by JAX": lambda: (lambda slope: lambda t: slope(t))(jax.grad(lambda t: SPEED * t**2)),
+    "names made when it runs": lambda: reading_an_attribute("speed"),
+    "a function of itself": of_itself,
+    "many numbers": lambda: (lambda values: lambda t: values[0] * t)([0.0] * 20_000),
+    "an object of a library": lambda: (lambda queue: lambda t: queue[0] * t)(collections.deque([2.0])),
+    "slots": lambda: (lambda slots: lambda t: slots.speed * t)(Slots(2.0)),
 }
 
 
@@ -127,6 +148,8 @@ UNLIKE = {
     "defaults": (functools.partial(MADE["defaults"]()), functools.partial(MADE["defaults"](), 3.0)),
     "an array for a number": (scaled(2.0), scaled(jnp.array(2.0))),
     "attributes": (Motor(2.0).turn, Motor(3.0).turn),
+    "objects that are only themselves": (scaled(object()), scaled(object())),
+    "programs of JAX": (scaled(jax.jit(lambda t: t)), scaled(jax.jit(lambda t: t))),
     "functions in pytrees": (Wave(jnp.array(2.0), lambda t: t), Wave(jnp.array(2.0), lambda t: -t)),
 }
 
@@ -137,23 +160,34 @@ def test_functions_that_differ_are_not_the_same(pair):
     assert one != other
 
 
-UNDECIDED = {
-    "names made when it runs": lambda: reading_an_attribute("speed"),
-    "a function of itself": of_itself,
-    "a variable that it changes": counting,
-    "an object of unknown kind": lambda: scaled(object()),
-    "a program of JAX": lambda: scaled(jax.jit(lambda t: t)),
-    "too much": lambda: scaled([0.0] * 20_000),
+def within(values):
+    return lambda t: t if values["of"][0].lock.locked() else 0.0
+
+
+def _reading(value):
+    return lambda t: 0.0 if value is None else t
+
+
+REFUSED = {
+    "of a system": (lambda: _reading(threading.Lock()), r"value, a _thread\.lock, which cannot be compared"),
+    "a generator": (lambda: _reading(t for t in ()), r"value, a builtins\.generator, which cannot be compared"),
+    "within": (lambda: within({"of": [types.SimpleNamespace(lock=threading.Lock())]}), r"values\.of\.lock, a _thread"),
+    "too much": (lambda: _reading([0.0] * 200_000), "value, more than 100000 values"),
+    "anything": (lambda: lambda t: globals()["SPEED"] * t, "globals, by which code can read anything"),
 }
 
 
-@pytest.mark.parametrize("made", UNDECIDED.values(), ids=UNDECIDED)
-def test_what_cannot_be_decided_is_the_same_as_itself_alone(made):
-    function = made()
-    code, _ = Code.of(function)
-    assert code == Code.of(function)[0]
-    assert code != Code.of(made())[0]
-    assert code.with_numbers(()) is function
+@pytest.mark.parametrize(("made", "told"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_compared_is_refused_by_name(made, told):
+    with pytest.raises(ValueError, match=f"torque.*: its function reads {told}.*let it read numbers"):
+        lx.JointTorque("hinge", made())
+
+
+def test_one_that_changes_what_it_reads_is_refused_when_it_is_called_again():
+    law = counting()
+    code, _ = Code.of(law)
+    law(0.0)
+    assert code.has_changed()
 
 
 def _closed_over(change):
@@ -162,6 +196,7 @@ def _closed_over(change):
 
 
 ARRAY, MOTOR = np.arange(3.0), Motor(2.0)
+SLOPE, COMPILED = jax.grad(at_speed), jax.jit(at_speed)
 CHANGES = {
     "an entry of a dictionary": _closed_over(lambda values: values.update(by=4.0)),
     "an entry of a list": _closed_over(lambda values: values["of"].append(1.0)),
@@ -173,6 +208,14 @@ CHANGES = {
     "an attribute of a module": (MADE["a module"](), lambda patch: patch.setattr(settings, "speed", 3.0)),
     "an attribute": (MOTOR.turn, lambda patch: patch.setattr(MOTOR, "speed", 3.0)),
     "an attribute of a class": (Motor(1.0), lambda patch: patch.setattr(Motor, "gear", 1.0)),
+    "slots": ((lambda slots: (lambda t: slots.speed, lambda _: setattr(slots, "speed", 3.0)))(Slots(2.0))),
+    "a queue": ((lambda queue: (lambda t: queue[0], lambda _: queue.append(3.0)))(collections.deque([2.0]))),
+    "an attribute by name": (reading_an_attribute("speed"), lambda patch: patch.setattr(settings, "speed", 3.0)),
+    "a dictionary with attributes": ((lambda other: (lambda t: other.k, lambda _: other.update(k=3.0)))(Other(k=2.0))),
+    "the environment": (lambda t: float(os.environ["TORQUE"]), lambda patch: patch.setenv("TORQUE", "5")),
+    "a function of JAX's": (lambda t: SLOPE(t), lambda patch: patch.setitem(globals(), "SPEED", 3.0)),
+    "a compiled one": (lambda t: COMPILED(t), lambda patch: patch.setitem(globals(), "SPEED", 3.0)),
+    "a class of a pytree": (Wave(jnp.array(2.0)), lambda patch: patch.setattr(Wave, "__call__", lambda self, t: t)),
     "a global that a method reads": (Motor(4.0).turn, lambda patch: patch.setitem(globals(), "SPEED", 3.0)),
 }
 
@@ -184,6 +227,16 @@ def test_changes_of_what_a_function_reads_are_seen(function, change, monkeypatch
     change(monkeypatch)
     assert code.has_changed()
     assert code != Code.of(function)[0]
+
+
+@pytest.mark.parametrize("made", [jax.jit, eqx.filter_jit, functools.cache], ids=lambda made: made.__module__)
+def test_a_function_that_keeps_what_it_has_read_reads_it_anew(made, monkeypatch):
+    kept = made(at_speed)
+    law = lambda t: kept(t)
+    for speed in (2.0, 3.0):
+        monkeypatch.setitem(globals(), "SPEED", speed)
+        code, numbers = Code.of(law)
+        assert code.with_numbers(numbers)(0.5) == 0.5 * speed
 
 
 def test_another_array_in_place_of_one_is_seen():

@@ -1,6 +1,9 @@
 """Mechanisms built again and again, with functions in them that are made anew each time."""
 
+import threading
+
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +12,7 @@ from compilations import compilations
 from mechanisms import pendulum
 
 import linkax as lx
+from linkax.model.mechanism import require_unchanged
 
 HINGE = ("hinge", lx.GROUND)
 
@@ -107,6 +111,96 @@ def test_a_drive_at_constant_speed_goes_on_or_is_held(moves):
     at_zero = drive.attached({}, {"hinge": jnp.zeros(1)}, ())
     np.testing.assert_allclose(held.residual(1.0, at_zero), -6.3 if moves else -1.5, rtol=1e-15)
     np.testing.assert_allclose(drive.held(0.2).residual(1.0, at_zero), -1.5, rtol=1e-15)
+
+
+TORQUE = 5.0
+
+
+class Constant(lx.AbstractForce):
+    joint: str = eqx.field(static=True)
+    of: object = eqx.field(static=True, default=None)
+
+    @property
+    def terms(self):
+        return (lx.Term(self.joint, None),)
+
+    def load(self, t, motion):
+        return motion.joint_load(self.terms[0], jnp.asarray(TORQUE if self.of is None else self.of.torque))
+
+
+class Law(lx.ContactLaw):
+    def elastic_force(self, depth):
+        return TORQUE * depth
+
+
+class Held(lx.AbstractConstraint):
+    units = ("rad",)
+    hinge: str = eqx.field(static=True, default="hinge")
+
+    @property
+    def joints(self):
+        return (self.hinge,)
+
+    def residual(self, t, attached):
+        return attached.joint(self.hinge) - TORQUE
+
+
+class Hinge(lx.AbstractJoint):
+    speed_units = ("rad",)
+
+    def transform(self, coordinates):
+        axis = jnp.array([TORQUE / TORQUE, 0.0, 0.0])
+        return jax.scipy.linalg.expm(coordinates[0] * jnp.cross(axis, jnp.eye(3))), jnp.zeros(3)
+
+
+class Settings:
+    def __init__(self):
+        self.torque, self.unread = 5.0, None
+
+
+SETTINGS = Settings()
+ARM = lx.rod("arm", 1.0, 1.0)
+OWN = {
+    "a force": lambda: pendulum(forces=[Constant("hinge")]),
+    "a field of a force": lambda: pendulum(forces=[Constant("hinge", SETTINGS)]),
+    "a part of a force": lambda: pendulum(
+        forces=[lx.Contact(lx.Sphere(ARM.at("tip"), 0.1), lx.Plane(lx.GROUND), Law(1e5))]
+    ),
+    "a constraint": lambda: pendulum(constraints=[Held("held")]),
+    "a joint": lambda: lx.Mechanism([ARM], [Hinge("hinge", lx.GROUND, ARM.at("base"), "z")]),
+}
+
+
+@pytest.mark.parametrize("build", OWN.values(), ids=OWN)
+def test_a_mechanism_whose_elements_read_what_has_changed_is_refused(build, monkeypatch):
+    mechanism, again = build(), build()
+    assert mechanism.own_classes
+    assert mechanism.own_classes == again.own_classes
+    SETTINGS.unread = object()
+    lx.State.as_drawn(mechanism)
+    require_unchanged(mechanism)
+    monkeypatch.setitem(globals(), "TORQUE", 50.0)
+    monkeypatch.setattr(SETTINGS, "torque", 50.0)
+    with pytest.raises(ValueError, match=r"\w+: what this class reads \(.*TORQUE.*\) has changed .* anew"):
+        lx.assemble(mechanism)
+    assert build().own_classes != mechanism.own_classes
+
+
+def test_a_number_that_an_element_reads_is_that_of_now(monkeypatch):
+    build = OWN["a force"]
+    of_state = lambda mechanism: lx.Solution.of_state(mechanism, lx.State.as_drawn(mechanism))
+    accelerated = lambda: float(of_state(build()).joint_acceleration("hinge")[0])
+    first = accelerated()
+    with compilations() as compiled:
+        assert accelerated() == first
+    assert not compiled
+    monkeypatch.setitem(globals(), "TORQUE", 50.0)
+    np.testing.assert_allclose(accelerated() - first, 45.0 * 3.0, rtol=1e-13)  # inertia of a rod: m l² / 3
+
+
+def test_elements_that_read_what_cannot_be_compared_are_refused():
+    with pytest.raises(ValueError, match=r"own reads Constant, a _thread\.lock, which cannot be compared; .* let it"):
+        pendulum(forces=[Constant("hinge", threading.Lock())])
 
 
 def test_a_mechanism_whose_functions_have_changed_is_refused():

@@ -12,11 +12,12 @@ from jaxtyping import Float
 
 from linkax.equations.structure import Structure, structure_of
 from linkax.linalg.static_sparse import constant_product
+from linkax.model.code import OwnClasses
 from linkax.model.constraints.constraint import AbstractConstraint
 from linkax.model.forces.joint_forces import JointInertia
 from linkax.model.joints.joint import RelativeMotion
 from linkax.model.joints.table_joint import TableJoint
-from linkax.model.mechanism import Mechanism
+from linkax.model.mechanism import Mechanism, require_unchanged
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import largest
 from linkax.spatial.vectors import length as length_of
@@ -42,10 +43,12 @@ class System(KnowsEntries):
     - `loop_length` [m] (n_cut,): half the way around each loop, the unit of its translation rows.
     - `length` [m]: the mechanism's length, the unit of sliding coordinates.
     - `forces`: force elements, or such held on one side of their switch.
+    - `own_classes`: what a user's classes among forces, constraints and joints read, see `Mechanism`.
     - `constraint_scales` (k,): one unit of each row of the constraints, in radians and lengths of the mechanism.
     """
 
     topology: Topology = eqx.field(static=True)
+    own_classes: OwnClasses = eqx.field(static=True)
     mass: Float[Array, " n_b"]
     center_of_mass: Float[Array, "n_b 3"]
     inertia: Float[Array, "n_b 3 3"]
@@ -92,6 +95,7 @@ def system_of(mechanism: Mechanism | Flat[Mechanism], dtype: DTypeLike, fixed_sc
     what is told in them does, such as the distance from a singular configuration.
     """
     flat = mechanism if isinstance(mechanism, Flat) else flat_with_known(mechanism)
+    require_unchanged(flat.tree)
     known = flat.noted.through(_stacked, flat.tree, np.dtype(dtype), fixed_scales)
     return dataclasses.replace(_stacked(flat.tree, dtype, fixed_scales), known=known)
 
@@ -118,6 +122,7 @@ def _stacked(mechanism, dtype, fixed_scales) -> System:
     constraint_scales = [unit for each in mechanism.constraints for unit in each.row_scales(length, slides)]
     return System(
         known=None,
+        own_classes=mechanism.own_classes,
         topology=topology,
         mass=stack([body.mass for body in mechanism.bodies], ()),
         center_of_mass=center_of_mass,

@@ -7,10 +7,13 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dis import get_instructions
 from enum import Enum
+from importlib import import_module
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,11 +23,23 @@ from linkax.xla.users_line import LIBRARIES
 Maker = Callable[[Iterator[Any]], Any]  # makes a value again from an iterator of its numbers
 
 
-class Undecided(Exception):
-    """Raised where values cannot be compared."""
+class NotComparable(ValueError):
+    """Raised where values cannot be compared; `names` of variables and attributes lead there."""
+
+    def __init__(self, why: str, names: tuple[str, ...] = ()) -> None:
+        super().__init__(f"{'.'.join(names)}, {why}" if names else why)
+        self.why, self.names = why, names
 
 
-class Same:
+class NotMadeAgain(Exception):
+    """Raised where a value cannot be made again with other numbers, since it holds itself."""
+
+
+class Key:
+    """What compares itself."""
+
+
+class Same(Key):
     """A value that equals only itself."""
 
     def __init__(self, value: Any) -> None:
@@ -38,18 +53,24 @@ class Same:
 
 
 _ATOMS = (type(None), bool, int, float, complex, str, bytes, type(...), range)
-# Compared by identity, as JAX does.
-_OPAQUE = (np.ufunc, type(np.dot), jnp.ufunc, type(jax.jit(abs)), jax.custom_jvp, jax.custom_vjp, Enum)
+# What keeps results of a function, or what was traced of it.
+_KEEPING = (type(jax.jit(abs)), type(eqx.filter_jit(abs)), type(functools.cache(abs)))
+# Compared by identity, as JAX does, and by the functions that they are made of.
+_OPAQUE = (*_KEEPING, np.ufunc, type(np.dot), jnp.ufunc, jax.custom_jvp, jax.custom_vjp, Enum)
+_OPAQUE += (types.MemberDescriptorType, types.GetSetDescriptorType)
+_MADE_OF = ("__wrapped__", "jvp", "fwd", "bwd")
 _BASES = (object, abc.ABC, typing.Generic, typing.Protocol, types.SimpleNamespace)
-# Functions that read by names which are in no code.
-_DYNAMIC = {"getattr", "vars", "globals", "locals", "eval", "exec", "__import__", "import_module", "__dict__"}
-_DYNAMIC |= {"attrgetter", "methodcaller", "asdict", "astuple", "fields", "copy", "deepcopy", "__getattribute__"}
+# Functions that read by names which are in no code: of what is given to them, and of anything.
+_BY_NAME = {"getattr", "vars", "__dict__", "attrgetter", "methodcaller", "asdict", "astuple", "fields", "copy"}
+_BY_NAME |= {"deepcopy", "__getattribute__"}
+_ANYTHING = {"globals", "eval", "exec", "__import__", "import_module"}
 _UNCALLED = {"__init__", "__new__", "__post_init__", "__init_subclass__", "__setattr__", "__repr__", "__str__"}
 _UNCALLED |= {"__eq__", "__hash__"}
-_MOST_PARTS = 10_000
+_ALL = "*"  # in place of names: what is reached is read whole
+_MOST_PARTS = 100_000
 
 
-def _is_library(value: Any) -> bool:
+def is_library(value: Any) -> bool:
     """Tell whether a module, class or function is of Python, an installed package or linkax, which no user changes."""
     if isinstance(value, types.FunctionType):
         path = value.__code__.co_filename
@@ -75,19 +96,17 @@ def _all_code(code: types.CodeType) -> Iterator[types.CodeType]:
 
 @functools.lru_cache(maxsize=1024)
 def _names(code: types.CodeType) -> tuple[set[str], set[str]]:
-    """Find the names of globals and attributes in code, and of modules that it imports when it runs."""
+    """Find the names of globals and attributes that code reads, and of modules that it imports when it runs."""
     names, imported = set(), set()
     for part in _all_code(code):
-        names.update(part.co_names)
         for at in get_instructions(part):
-            assigns = at.opname.startswith(("STORE_", "DELETE_"))
-            if assigns and (at.opname.endswith("_GLOBAL") or at.argval in part.co_freevars):
-                raise Undecided  # it changes variables outside of itself
+            if at.argval in part.co_names and not at.opname.startswith(("STORE_", "DELETE_")):
+                names.add(at.argval)
             if at.opname == "IMPORT_NAME":
                 imported.add(at.argval)
-    if names & _DYNAMIC:
-        raise Undecided
-    return names, imported
+    if names & _ANYTHING:
+        raise NotComparable("by which code can read anything", (min(names & _ANYTHING),))
+    return names | {_ALL} if names & _BY_NAME else names, imported
 
 
 class Walk:
@@ -95,23 +114,23 @@ class Walk:
 
     Each part gives a key, which compares it, and a `Maker`.
 
-    - `names`: names in all code met so far.
-    - `numbers`: numbers met so far.
+    - `names`: names in all code met so far. `variables`: of a user's that functions close over or read as globals.
+    - `numbers`: numbers met so far. `keeping`: functions of `jax.jit` and `functools.cache`.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
-        self.names, self.numbers = set(names), []
+        self.names, self.numbers, self.variables, self.keeping = set(names), [], {}, []
         self._attributes, self._around, self._count, self._is_traced = frozenset(names), [], 0, True
+        self._classes = set()
 
     def part(self, value: Any, is_explicit: bool = False) -> tuple[Any, Maker]:
-        """Find the key and the maker of a value.
+        """Find the key and the maker of a value; where `is_explicit`, its floats and NumPy arrays are numbers too.
 
-        Where `is_explicit`, its floats and NumPy arrays are numbers too, and parts of it that cannot be compared are
-        compared by identity, as JAX does.
+        **Raises:** `NotComparable`, `NotMadeAgain`.
         """
         self._count += 1
         if self._count > _MOST_PARTS:
-            raise Undecided
+            raise NotComparable(f"more than {_MOST_PARTS} values, where an array would be one")
         is_number = isinstance(value, jax.Array) or (is_explicit and isinstance(value, float | np.ndarray | np.generic))
         if is_number and self._is_traced:
             self.numbers.append(value)
@@ -121,17 +140,16 @@ class Walk:
         for place, around in enumerate(self._around):
             if around is value:
                 if self._is_traced:
-                    raise Undecided  # made again it would hold itself
+                    raise NotMadeAgain
                 return ("again", place), lambda _: value
         self._around.append(value)
-        numbers, around = len(self.numbers), len(self._around)
+        numbers = len(self.numbers)
         try:
             return self._compound(value, is_explicit)
-        except Undecided:
-            if not is_explicit or around == 1:
+        except NotComparable:
+            if not (isinstance(value, types.FunctionType) and is_library(value)):
                 raise
-            del self.numbers[numbers:], self._around[around:]
-            self._is_traced = True
+            del self.numbers[numbers:]
             return Same(value), lambda _: value
         finally:
             self._around.pop()
@@ -139,23 +157,23 @@ class Walk:
     def key(self, value: Any) -> Any:
         """Find the key of a value that is read and not made again, so that its arrays are no numbers."""
         traced, self._is_traced = self._is_traced, False
-        key, _ = self.part(value)
-        self._is_traced = traced
-        return key
+        try:
+            return self.part(value)[0]
+        finally:
+            self._is_traced = traced
 
     def _atom(self, value: Any) -> Any:
+        if isinstance(value, Key):
+            return value
         if type(value) in _ATOMS or isinstance(value, np.dtype):
             return type(value), repr(value)  # tells 0.0 from -0.0, and 1 from 1.0
         if isinstance(value, np.generic) or type(value) is np.ndarray:
-            if value.dtype.hasobject:
-                raise Undecided
-            return type(value), repr(value.dtype), value.shape, value.tobytes()
-        if isinstance(value, (jax.Array, *_OPAQUE)):
+            return None if value.dtype.hasobject else (type(value), repr(value.dtype), value.shape, value.tobytes())
+        if isinstance(value, jax.Array):
             return Same(value)
-        is_read = isinstance(value, type | types.ModuleType | types.FunctionType) and self._around
-        if is_read and _is_library(value):
-            return Same(value)
-        return None
+        # A function that a library has made, such as by `jax.grad`, closes over what it was made of.
+        is_open = isinstance(value, types.FunctionType) and self._around and not value.__closure__
+        return Same(value) if (isinstance(value, type) or is_open) and is_library(value) else None
 
     def _compound(self, value: Any, is_explicit: bool) -> tuple[Any, Maker]:
         kind = type(value)
@@ -164,8 +182,6 @@ class Walk:
         if kind is types.MethodType:
             explicit = (False, is_explicit and _is_pytree(value.__self__))
             return self._parts(kind, (value.__func__, value.__self__), lambda parts: kind(*parts), explicit)
-        if kind is types.BuiltinFunctionType:
-            return (kind, value.__name__, self.key(value.__self__)), lambda _: value
         if kind in (functools.partial, jax.tree_util.Partial):
             is_explicit = kind is jax.tree_util.Partial
             parts = (value.func, value.args, value.keywords)
@@ -175,73 +191,140 @@ class Walk:
         if kind is dict:
             keys = tuple(map(self.key, value))
             made = lambda parts: dict(zip(value, parts, strict=True))
-            return self._parts((kind, keys), list(value.values()), made, [is_explicit] * len(keys))
+            return self._parts((kind, keys), list(value.values()), made, [is_explicit] * len(keys), list(value))
+        if isinstance(value, (type, *_OPAQUE)) or not _is_pytree(value):
+            return self._read_only(value), lambda _: value
+        leaves, structure = jax.tree.flatten(value, is_leaf=lambda node: node is not value)
+        key = tuple(map(self.key, structure.node_data()))  # its class, and what is no leaf
+        return self._parts(key, leaves, structure.unflatten, [is_explicit] * len(leaves))
+
+    def _read_only(self, value: Any) -> Any:
+        """Find the key of what is never made again."""
+        kind = type(value)
+        if isinstance(value, _OPAQUE):
+            return self._opaque(value)
+        if kind is types.BuiltinFunctionType:
+            return kind, value.__name__, self.key(value.__self__)
         if kind in (staticmethod, classmethod):
-            return (kind, self.key(value.__func__)), lambda _: value
+            return kind, self.key(value.__func__)
         if kind is property:
-            return (kind, self.key([value.fget, value.fset])), lambda _: value
-        if _is_pytree(value):
-            return self._pytree(value, is_explicit)
-        if isinstance(value, type | types.ModuleType):
-            return (Same(value), self._read(value)), lambda _: value
-        return self._instance(value)
+            return kind, self.key([value.fget, value.fset])
+        if kind is functools.cached_property:
+            return kind, self.key(value.func)
+        if isinstance(value, types.ModuleType):
+            return Same(value), self._settings(value) if is_library(value) else self._read(value)
+        if not isinstance(value, type):
+            return self._instance(value)
+        if value in self._classes:  # of many instances
+            return Same(value)
+        read = self._read(value)
+        self._classes.add(value)
+        return Same(value), read
 
     def _parts(
-        self, kind: Any, values: Iterable[Any], made: Callable[[list[Any]], Any], explicit: Sequence[bool]
+        self,
+        kind: Any,
+        values: Iterable[Any],
+        made: Callable[[list[Any]], Any],
+        explicit: Sequence[bool],
+        names: Sequence[Any] | None = None,
     ) -> tuple[Any, Maker]:
-        found = [self.part(value, is_explicit) for value, is_explicit in zip(values, explicit, strict=True)]
+        found = []
+        for place, (value, is_explicit) in enumerate(zip(values, explicit, strict=True)):
+            try:
+                found.append(self.part(value, is_explicit))
+            except NotComparable as error:
+                if names is None or not isinstance(names[place], str):
+                    raise
+                raise NotComparable(error.why, (names[place], *error.names)) from error
         makers = [maker for _, maker in found]
         return (kind, *(key for key, _ in found)), lambda numbers: made([maker(numbers) for maker in makers])
 
-    def _pytree(self, value: Any, is_explicit: bool) -> tuple[Any, Maker]:
-        leaves, structure = jax.tree.flatten(value, is_leaf=lambda node: node is not value)
-        try:
-            hash(structure)
-        except TypeError as error:
-            raise Undecided from error
-        return self._parts(structure, leaves, structure.unflatten, [is_explicit] * len(leaves))
-
     def _function(self, function: types.FunctionType) -> tuple[Any, Maker]:
         code = function.__code__
-        names, imported = _names(code)
-        if not sys.modules.keys() >= imported:
-            raise Undecided
+        of_user = not is_library(function)
+        names, imported = _names(code) if of_user else (set(), set())
         self.names |= names
-        try:
-            closed_over = [cell.cell_contents for cell in function.__closure__ or ()]
-        except ValueError as error:
-            raise Undecided from error
-        captured = (closed_over, function.__defaults__, function.__kwdefaults__)
-        key, maker = self.part(captured)
-        spaces = (vars(builtins), function.__globals__, {name: sys.modules[name] for name in imported})
-        read = self.key([[(name, space[name]) for name in sorted(names) if name in space] for space in spaces])
+        cells = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
+        closed_over = {name: cell.cell_contents for name, cell in cells.items() if cell != types.CellType()}
+        if len(closed_over) < len(cells) and self._is_traced:
+            raise NotMadeAgain  # of what is defined later
+        for name in imported:
+            with suppress(ImportError):
+                import_module(name)
+        modules = {name: sys.modules[name] for name in imported if name in sys.modules}
+        read = [
+            {name: space[name] for name in sorted(names) if name in space}
+            for space in (vars(builtins), function.__globals__, modules)
+        ]
+        if of_user:
+            self.variables |= dict.fromkeys((*closed_over, *(name for name in read[1] if not _is_fixed(read[1][name]))))
+        key, maker = self.part((closed_over, function.__defaults__, function.__kwdefaults__))
+        others = {name: value for name, value in vars(function).items() if name != "__wrapped__"}
 
         def made(numbers: Iterator[Any]) -> types.FunctionType:
             closed_over, defaults, keywords = maker(numbers)
-            cells = tuple(map(types.CellType, closed_over))
+            cells = tuple(map(types.CellType, closed_over.values()))
             again = types.FunctionType(code, function.__globals__, function.__name__, defaults, cells)
             again.__kwdefaults__ = keywords
             vars(again).update(vars(function))
             return again
 
-        return (code, Same(function.__globals__), key, read, self.key(vars(function))), made
+        return (code, Same(function.__globals__), key, self.key(read), self.key(others)), made
 
-    def _instance(self, value: Any) -> tuple[Any, Maker]:
+    def _opaque(self, value: Any) -> Any:
+        parts = [getattr(value, name, None) for name in _MADE_OF]
+        if isinstance(value, _KEEPING) and self._atom(parts[0]) is None:
+            self.keeping.append(value)
+        return Same(value), *map(self.key, parts)
+
+    def _instance(self, value: Any) -> Any:
         kind = type(value)
-        of_user = [base for base in kind.__mro__ if base not in _BASES]
-        if not hasattr(value, "__dict__") or any(map(_is_library, of_user)):
-            raise Undecided
-        return (Same(kind), self._read(kind), self._read(value)), lambda _: value
+        if kind is object:
+            return Same(value)
+        if is_library(kind) and kind.__hash__ not in (None, object.__hash__):
+            with suppress(TypeError):
+                return kind, hash(value), value  # such do not change
+        bases = [base for base in kind.__mro__ if base not in _BASES]
+        by_attributes = hasattr(value, "__dict__") and not any(is_library(b) or "__slots__" in vars(b) for b in bases)
+        return self.key(kind), self._read(value) if by_attributes else self._reduced(value)
+
+    def _reduced(self, value: Any) -> Any:
+        """Find the key of all that a copy of an object would be made of."""
+        kind = type(value)
+        try:
+            parts = value.__reduce_ex__(4)
+        except Exception as error:
+            raise NotComparable(f"a {kind.__module__}.{kind.__qualname__}, which cannot be compared") from error
+        if isinstance(parts, str):  # there is one
+            return Same(value)
+        return self.key([list(part) if isinstance(part, Iterator) else part for part in parts])
+
+    def _settings(self, library: types.ModuleType) -> Any:
+        """Find the key of what code names in a library that is no function, such as `os.environ`."""
+        found = {}
+        for name in sorted(self._attributes & vars(library).keys()):
+            value = vars(library)[name]
+            if name[:2] != "__" and not (callable(value) or isinstance(value, types.ModuleType)):
+                with suppress(NotComparable):
+                    found[name] = self.key(value)
+        return tuple(found.items())
 
     def _read(self, space: Any) -> Any:
         """Find the key of attributes of a module, class or instance that code names, or calls as operators."""
-        spaces = [base for base in space.__mro__ if not _is_library(base)] if isinstance(space, type) else [space]
+        spaces = [base for base in space.__mro__ if not is_library(base)] if isinstance(space, type) else [space]
+        reads_all = _ALL in self._attributes or hasattr(space, "__getattr__")
         found = {}
         for entries in map(vars, reversed(spaces)):
-            if "__getattr__" in entries:
-                raise Undecided
-            for name, value in entries.items():
-                is_operator = name[:2] == "__" == name[-2:] and name not in _UNCALLED
-                if name in self._attributes or (is_operator and isinstance(value, types.FunctionType)):
+            for name, value in list(entries.items()):
+                is_special = name[:2] == "__" == name[-2:]
+                is_operator = is_special and name not in _UNCALLED and isinstance(value, types.FunctionType)
+                is_read = name in self._attributes or (reads_all and not is_special and name != "_abc_impl")
+                if is_operator or is_read:
                     found[name] = value
-        return self.key(sorted(found.items(), key=lambda entry: entry[0]))
+        return self.key(dict(sorted(found.items())))
+
+
+def _is_fixed(value: Any) -> bool:
+    """Tell whether this is of a library."""
+    return isinstance(value, type | types.ModuleType | types.FunctionType) and is_library(value)

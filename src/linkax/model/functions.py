@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from linkax.model.code import Code
+from linkax.model.code import Code, OwnClasses, codes_of_classes
+from linkax.model.code_walk import NotComparable
 from linkax.model.numbers import converted, number
 from linkax.xla.arrays import Array
 
@@ -26,17 +27,23 @@ BY_TRACING = (
 Numbers = TypeVar("Numbers", bound=Array | np.floating)
 
 
+GIVE_VALUES = "linkax would not see it change, so let it read numbers, arrays or plain objects instead"
+
+
 class Function(eqx.Module):
     """A user's function as a pytree: its numbers are leaves, the rest is structure (see `Code`).
 
-    Both are taken when this is made, and do not follow later changes.
+    Both are taken when this is made, and do not follow later changes; `what` names it in errors.
     """
 
     numbers: tuple[jax.Array, ...]
     code: Code = eqx.field(static=True)
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.code, self.numbers = Code.of(function)
+    def __init__(self, function: Callable[..., Any], what: str = "a function") -> None:
+        try:
+            self.code, self.numbers = Code.of(function)
+        except NotComparable as error:
+            raise ValueError(f"{what}: its function reads {error}; {GIVE_VALUES}") from error
 
     def __call__(self, *arguments: Any) -> Any:
         return self.code.with_numbers(self.numbers)(*arguments)
@@ -50,16 +57,11 @@ class Law(eqx.Module):
     what: str = eqx.field(static=True)
 
     def __init__(self, function: Callable[..., Any], shape: tuple[int, ...], what: str) -> None:
-        self.function, self.shape, self.what = Function(function), shape, what
+        self.function, self.shape, self.what = Function(function, what), shape, what
 
     def check(self) -> None:
         """Raise a `ValueError` where what the function reads has changed since the mechanism was built."""
-        if self.function.code.has_changed():
-            variables = ", ".join(self.function.code.variables)
-            raise ValueError(
-                f"{self.what}: what its function reads ({variables}) has changed since the mechanism was built; "
-                "build the mechanism anew"
-            )
+        check_unchanged(f"{self.what}: what its function reads", self.function.code)
 
     def __call__(self, *arguments: Any) -> Float[jax.Array, "..."]:
         self.check()
@@ -73,6 +75,22 @@ class Law(eqx.Module):
             expected = "a single number" if self.shape == () else f"an array of shape {self.shape}"
             raise ValueError(f"{self.what}: its function returns shape {found.shape}; it must return {expected}")
         return found if jnp.issubdtype(found.dtype, jnp.floating) else 1.0 * found
+
+
+def check_unchanged(what: str, code: Code) -> None:
+    """Raise a `ValueError` where what code reads has changed since the mechanism was built."""
+    if code.has_changed():
+        raise ValueError(
+            f"{what} ({', '.join(code.variables)}) has changed since the mechanism was built; build the mechanism anew"
+        )
+
+
+def own_classes(tree: Any) -> OwnClasses:
+    """The code of a user's classes in a mechanism, see `codes_of_classes`."""
+    try:
+        return codes_of_classes(tree)
+    except NotComparable as error:
+        raise ValueError(f"a class of your own reads {error}; {GIVE_VALUES}") from error
 
 
 # What a mistake in a user's own element raises.

@@ -6,15 +6,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import equinox as eqx
+import jax
 
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
+from linkax.model.code import OwnClasses
 from linkax.model.constraints.constraint import AbstractConstraint, CoordinateConstraint
 from linkax.model.description import described
 from linkax.model.discretisation import Parts, discretise_beams, split_cuts, to_split, tree_joints_first, with_inertia
 from linkax.model.elements import is_own
 from linkax.model.forces.force import AbstractForce, given_name
 from linkax.model.forces.internal_states import checked_states
+from linkax.model.functions import Law, check_unchanged, own_classes
 from linkax.model.immobile_rows import split_rows
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
@@ -24,6 +27,7 @@ from linkax.model.numbers import listed, read_only, require_bool
 from linkax.model.spanning_tree import SpanningTree, spanning_tree
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.tables import printed_as
+from linkax.xla.kept import kept_while_alive
 
 
 @printed_as(described)
@@ -57,6 +61,7 @@ class Mechanism(eqx.Module):
     forces: tuple[AbstractForce, ...]
     constraints: tuple[AbstractConstraint, ...]
     topology: Topology = eqx.field(static=True, repr=False)
+    own_classes: OwnClasses = eqx.field(static=True, repr=False)
 
     def __init__(
         self,
@@ -82,6 +87,7 @@ class Mechanism(eqx.Module):
         self.forces = read_only(tuple(parts.forces))
         self.constraints = read_only(tuple(parts.constraints))
         self.topology = _topology(tree, parts.constraints, require_bool(all_rows, "all_rows"))
+        self.own_classes = own_classes((self.beams, self.joints, self.forces, self.constraints))
 
     def with_all_rows(self) -> "Mechanism":
         """Return the same mechanism with the loop rows too that no motion changes (see `all_rows`)."""
@@ -118,6 +124,21 @@ class Mechanism(eqx.Module):
         from linkax.simulation.read.solution import Solution
 
         return Solution.of_state(self, state).view(path, **settings)
+
+
+def require_unchanged(mechanism: Mechanism) -> None:
+    """Raise a `ValueError` where what functions of a mechanism, or classes of a user, read has changed since then."""
+    for law in _laws(mechanism):
+        law.check()
+    for name, code in mechanism.own_classes:
+        check_unchanged(f"{name}: what this class reads", code)
+
+
+@kept_while_alive
+def _laws(mechanism):
+    is_law = lambda node: isinstance(node, Law)
+    elements = mechanism.joints, mechanism.forces, mechanism.constraints
+    return [*filter(is_law, jax.tree.leaves(elements, is_leaf=is_law))]
 
 
 # What belongs into each argument, and what to give; a `Distance`, which is a joint, first of all among constraints.

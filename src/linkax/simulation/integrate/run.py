@@ -221,7 +221,7 @@ def cast(tree: Tree, dtype: np.dtype) -> Tree:
 def _with_functions(saveat, event):
     """The same with their functions compared by what they compute, see `linkax.model.code`."""
     if event is not None:
-        functions = jax.tree.map(Function, event.cond_fn, is_leaf=callable)
+        functions = jax.tree.map(lambda function: Function(function, "event"), event.cond_fn, is_leaf=callable)
         event = eqx.tree_at(lambda e: e.cond_fn, event, functions)
     if not saves_states(saveat):
         is_sub = lambda node: isinstance(node, diffrax.SubSaveAt)
@@ -230,6 +230,6 @@ def _with_functions(saveat, event):
 
 
 def _with_function(sub):
-    if sub.fn is SAVE_STATE or (function := Function(sub.fn)).numbers:  # which diffrax takes for structure
+    if sub.fn is SAVE_STATE or (function := Function(sub.fn, "saveat")).numbers:  # which diffrax takes for structure
         return sub
     return eqx.tree_at(lambda s: s.fn, sub, function)

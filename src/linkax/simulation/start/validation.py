@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from linkax.model.elements import is_own
 from linkax.model.forces.internal_states import initial_values
 from linkax.model.functions import Law
-from linkax.model.mechanism import Mechanism
+from linkax.model.mechanism import Mechanism, require_unchanged
 from linkax.model.numbers import Number, Vector, is_finite, namespace, number, real, require, require_type
 from linkax.model.poses import Pose, Velocity
 from linkax.model.terms import TermLike, term
@@ -49,8 +49,7 @@ def check_mechanism(mechanism: Mechanism) -> None:
     require_type(
         mechanism, Mechanism, "mechanism", "give a linkax.Mechanism, such as your function of parameters returns"
     )
-    for law in filter(_is_law, jax.tree.leaves((mechanism.forces, mechanism.constraints), is_leaf=_is_law)):
-        law.check()
+    require_unchanged(mechanism)
     for body in mechanism.bodies:
         if np.shape(body.mass) != ():
             raise ValueError(
