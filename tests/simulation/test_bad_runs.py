@@ -268,6 +268,32 @@ def test_what_cannot_move_is_named():
     refused(lambda: lx.Mechanism([], []), "bodies", "[]")
 
 
+OFF = {
+    "position": (lambda q, v: (q.at[0].add(0.1), v), r"'\w+' is open by 0\.\d+, in radians or lengths"),
+    "speed": (lambda q, v: (q, v.at[0].add(0.1)), r"they miss its speeds by 0\.0\d+ of the largest one"),
+}
+
+
+@pytest.mark.parametrize(("moved", "told"), OFF.values(), ids=OFF)
+def test_a_state_off_the_loops_is_named_and_marked(moved, told):
+    on = lx.assemble(MECHANISM, {"bearing": 0.5}, {"bearing": 2.0})
+    off = lx.State(*moved(on.q, on.v))
+    with pytest.raises(ValueError, match=f"state is off the loops: {told}.*linkax.assemble"):
+        lx.Solution.of_state(MECHANISM, off)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), lx.State(on.q, on.v), off)
+    results = jax.vmap(lambda state: lx.Solution.of_state(MECHANISM, state).result)(both)
+    assert (results == lx.RESULTS.not_closed).tolist() == [False, True]
+    # Classical formulations may leave loops open, and pictures show them.
+    lx.Solution.of_state(MECHANISM, off, formulation="lagrange-multipliers")
+    MECHANISM.view(off)
+
+
+def test_a_state_copied_from_seven_digits_is_read():
+    on = lx.assemble(MECHANISM, {"bearing": 0.5}, {"bearing": 2.0})
+    copied = lx.State(*(jnp.array([float(f"{number:.7g}") for number in array]) for array in (on.q, on.v)))
+    np.testing.assert_allclose(lx.Solution.of_state(MECHANISM, copied).joint("bearing"), 0.5, rtol=1e-6)
+
+
 def test_a_drive_that_is_not_finite_is_named():
     mechanism = pendulum(constraints=[lx.Drive("motor", "hinge", lambda t: jnp.sqrt(t - 2.0))])
     refused(lambda: lx.simulate(mechanism, AT_REST, t1=1.0), "'motor'", "not finite")

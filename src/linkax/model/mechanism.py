@@ -121,9 +121,9 @@ class Mechanism(eqx.Module):
 
     def view(self, state: Any, path: str | os.PathLike | None = None, **settings: Any) -> Any:
         """Show the mechanism at a `linkax.State` in three dimensions; see `linkax.Solution.view`."""
-        from linkax.simulation.read.solution import Solution
+        from linkax.simulation.read.solution import drawn
 
-        return Solution.of_state(self, state).view(path, **settings)
+        return drawn(self, state).view(path, **settings)
 
 
 def require_unchanged(mechanism: Mechanism) -> None:

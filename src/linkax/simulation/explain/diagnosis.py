@@ -21,6 +21,7 @@ from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.saddle_inverse import invert
 from linkax.model.constraints.constraint import Drive
+from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.results import RESULTS, Solution
 from linkax.simulation.start.initial_state import MOVES, moving_joints
 from linkax.xla.arrays import Array, Scalar
@@ -138,7 +139,7 @@ def _contradiction(solution, system, t):
     end = solution.end
     if solution.result != RESULTS.dt_min_reached or not system.topology.num_rows or not np.all(np.isfinite(end.q)):
         return ""
-    name, size = _widest(system, solution.mechanism, t, end.q)
+    name, size = widest_gap(system, solution.mechanism, t, end.q)
     if size <= OPEN_ULPS * jnp.finfo(system.dtype).eps:
         return ""
     return (
@@ -150,12 +151,12 @@ def _contradiction(solution, system, t):
 
 def _open(system, mechanism, t, q):
     """Name the joint or constraint that is open widest."""
-    name, size = _widest(system, mechanism, t, q)
+    name, size = widest_gap(system, mechanism, t, q)
     return f" Joint {name!r} is open by {size:.3g}, in radians or lengths of the mechanism."
 
 
-def _widest(system, mechanism, t, q):
-    """The joint or constraint that is open widest, and by how much."""
+def widest_gap(system: System, mechanism: Mechanism, t: Scalar, q: Float[Array, " n_q"]) -> tuple[str, float]:
+    """The joint or constraint that is open widest, and by how much, in radians or lengths of the mechanism."""
     gap, topology = gaps(configure(system, t, q)).in_scales(system), mechanism.topology
     names = [*topology.joints[topology.num_bodies :], *(topology.constraints[c] for c in topology.constraint_of_row)]
     sizes = np.concatenate([np.maximum(gap.distance, gap.angle), gap.constraints])

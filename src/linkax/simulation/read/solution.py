@@ -1,5 +1,6 @@
 """The motion that a simulation found, and what can be read from it."""
 
+import dataclasses
 import os
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from linkax.equations.reactions import Axes, Reaction, Side
+from linkax.equations.system import system_of
+from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.elements import AbstractElement
 from linkax.model.forces.force import AbstractForce
@@ -19,6 +22,7 @@ from linkax.model.joints.distance import Distance
 from linkax.model.mechanism import Mechanism
 from linkax.model.names import ByName, find
 from linkax.model.numbers import Number, Vector, number, require
+from linkax.simulation.explain.diagnosis import widest_gap
 from linkax.simulation.explain.error_estimate import refined_run
 from linkax.simulation.explain.remarks import remark
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
@@ -26,7 +30,7 @@ from linkax.simulation.integrate.impacts import impacts_of, record
 from linkax.simulation.integrate.integrate import Outcome, integrate_run
 from linkax.simulation.integrate.options import check_accuracy
 from linkax.simulation.integrate.results import REMARKS, RESULTS
-from linkax.simulation.integrate.run import Run, checked_formulation
+from linkax.simulation.integrate.run import DEFAULT_FORMULATION, Run, checked_formulation
 from linkax.simulation.read.by_name import (
     force_of,
     is_constraint,
@@ -42,13 +46,13 @@ from linkax.simulation.read.passages import Passages, passages
 from linkax.simulation.read.reading import evaluate_dense, kept, read, read_in_motion
 from linkax.simulation.read.summary import summary
 from linkax.simulation.read.work import work
-from linkax.simulation.start.initial_state import is_assembled
+from linkax.simulation.start.initial_state import is_assembled, off_loops
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
 from linkax.tables import printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.tracing import concrete, jit_inline
+from linkax.xla.tracing import all_concrete, concrete, jit_inline
 
 
 @printed_as(summary)
@@ -141,33 +145,25 @@ class Solution(Kinematics):
     ) -> "Solution":
         """A solution of one time, to read reactions, energies or accelerations at a `State` on the closed loops.
 
-        Inside JAX transformations, its `result` tells of a state that `linkax.assemble` did not find.
+        **Raises:** `ValueError` for a state off the loops, in positions or in speeds. Inside JAX transformations, its
+        `result` tells so, and of a state that `linkax.assemble` did not find. A classical formulation may leave loops
+        open.
         """
-        state = checked_state(mechanism, state)
+        state, method = checked_state(mechanism, state), checked_formulation(formulation, accuracy)
         check_accuracy(accuracy)
-        t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
-        result: Any = RESULTS.successful
-        if not concrete(sound := sound_numbers(mechanism)):
+        solution = drawn(mechanism, state, t, method, accuracy)
+        result, sound = solution.result, sound_numbers(mechanism)
+        topology = mechanism.topology
+        if topology.num_rows + topology.num_immobile_rows and not isinstance(method, ClassicalFormulation):
+            off = off_loops(solution.run.flat, solution.t_end, state)
+            if all_concrete(off) and not off.is_small:
+                raise ValueError(f"state is off the loops: {_off(solution, off)}; make it with linkax.assemble")
+            result = RESULTS.where(off.is_small, result, RESULTS.not_closed)
+        if not concrete(sound):
             result = RESULTS.where(sound, result, RESULTS.not_finite)
         if concrete(state.v) is None:
             result = RESULTS.where(is_assembled(state) | jnp.logical_not(sound), result, RESULTS.not_assembled)
-        return Solution(
-            run=Run.of_state(mechanism, state, t, checked_formulation(formulation, accuracy), accuracy),
-            ts=t[None],
-            q=state.q[None],
-            v=state.v[None],
-            internal=None if state.internal is None else state.internal[None],
-            ys=None,
-            t_end=t,
-            end=state,
-            stats={},
-            result=result,
-            rank_nearby=None,
-            closest=jnp.ones((), state.q.dtype),
-            average=jnp.ones((), state.q.dtype),
-            definiteness=jnp.ones((), state.q.dtype),
-            interpolation=None,
-        )
+        return dataclasses.replace(solution, result=result)
 
     def reaction(self, name: str, *, on: Side = "child", axes: Axes = "ground") -> Any:
         """The reaction of a joint, or the force of a constraint.
@@ -391,6 +387,44 @@ class Solution(Kinematics):
             t = require(t, during, "t [s]", f"give a time of the run, from {first} s to {last} s")
         given = self.run.flat, self.formulation, self.accuracy, self.rank_nearby, self.interpolation
         return evaluate_dense(*given, t)
+
+
+def drawn(
+    mechanism: Mechanism,
+    state: State,
+    t: Number = 0.0,
+    formulation: AbstractFormulation = DEFAULT_FORMULATION,
+    accuracy: Accuracy = BALANCED,
+) -> Solution:
+    """A solution of one time, to draw a state, on the loops or off."""
+    state = checked_state(mechanism, state)
+    t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
+    return Solution(
+        run=Run.of_state(mechanism, state, t, formulation, accuracy),
+        ts=t[None],
+        q=state.q[None],
+        v=state.v[None],
+        internal=None if state.internal is None else state.internal[None],
+        ys=None,
+        t_end=t,
+        end=state,
+        stats={},
+        result=RESULTS.successful,
+        rank_nearby=None,
+        closest=jnp.ones((), state.q.dtype),
+        average=jnp.ones((), state.q.dtype),
+        definiteness=jnp.ones((), state.q.dtype),
+        interpolation=None,
+    )
+
+
+def _off(solution, off):
+    """What a state off the loops misses."""
+    if off.gap <= off.most:
+        return f"they miss its speeds by {float(off.miss):.3g} of the largest one"
+    system, state = system_of(solution.mechanism, solution.end.q.dtype), solution.end
+    name, gap = widest_gap(system, solution.mechanism, solution.t_end, state.q)
+    return f"{name!r} is open by {gap:.3g}, in radians or lengths of the mechanism"
 
 
 @jit_inline

@@ -12,18 +12,24 @@ from jaxtyping import Bool, Float, Int
 from linkax.equations.configuration import configure
 from linkax.equations.gaps import gaps
 from linkax.equations.internal_states import bound
+from linkax.equations.loops import jacobian, rate
 from linkax.equations.motion import move
-from linkax.equations.system import System
+from linkax.equations.system import System, system_of
 from linkax.formulations.projected_state import ranks_along
 from linkax.formulations.tangent_space import TangentSpace
+from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
 from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
+from linkax.xla.derivatives import ratio
+from linkax.xla.flat import Flat
+from linkax.xla.program import Program
 from linkax.xla.tracing import without_derivatives
 
 MOVES = 1e-6  # of the largest speed
 SINGULAR_ULPS = 8.0  # times the number of speeds: what rounding leaves of a singular mass matrix
+SIX_DIGITS = 1e-6
 ON_BRANCH = 10.0  # rank tolerances that speeds may be off a branch, relative to their square
 
 
@@ -59,6 +65,37 @@ class InitialCheck(NamedTuple):
     def of_numbers(self, sound: Bool[Array, ""] | np.bool_) -> "InitialCheck":
         """Note whether the numbers of the mechanism are sound: what is wrong then."""
         return self._replace(finite=self.finite & sound, assembled=self.assembled | jnp.logical_not(sound))
+
+
+class OffLoops(NamedTuple):
+    """How far a state is off the closed loops.
+
+    - `gap`: the widest, in radians and lengths of the mechanism. `miss`: of J v = b, relative to the largest speed.
+    """
+
+    gap: Float[Array, ""]
+    miss: Float[Array, ""]
+
+    @property
+    def most(self) -> float:
+        """What a state may be off that is copied from six digits, or computed in single precision."""
+        return max(SIX_DIGITS, float(jnp.finfo(self.gap.dtype).eps) ** 0.5)
+
+    @property
+    def is_small(self) -> Bool[Array, ""]:
+        """Whether a state is as good as on the loops; false for numbers that are not finite."""
+        return (self.gap <= self.most) & (self.miss <= self.most)
+
+
+@Program
+def off_loops(flat: Flat[Mechanism], t: Float[Array, ""], state: State) -> OffLoops:
+    """How far a state at time t [s] is off the closed loops, in positions and in speeds."""
+    system = system_of(flat, state.q.dtype)
+    configuration = configure(system, t, state.q)
+    asked = rate(configuration)
+    miss = largest(jacobian(configuration) @ state.v - asked)
+    fastest = jnp.maximum(system.fastest(state.v), largest(asked))
+    return OffLoops(gaps(configuration).in_scales(system).widest(), ratio(miss, fastest, 0.0))
 
 
 def is_assembled(state: State) -> Bool[Array, ""]:
