@@ -260,6 +260,12 @@ def test_wrong_numbers_are_told():
         lx.PneumaticSpring(WALL, SLIDER, **GAS | {"free_length": 0.1})
 
 
+@pytest.mark.parametrize(("opening", "end"), [(1.0, r"closed \+ stroke"), (-1.0, "closed")])
+def test_a_cylinder_at_its_end_is_named(opening, end):
+    with pytest.raises(lx.SimulationError, match=f"piston of HydraulicCylinder.* beyond its end, {end}, where no oil"):
+        lx.simulate(*cylinder(100.0 * opening), t1=10.0)
+
+
 def _controlled(values):
     """Where an arm ends under an element of each kind, and a valve that follows values."""
     motor = lx.DCMotor("hinge", lx.Spline(RISE, values[:4]), resistance=2.0, inductance=values[4], constant=0.5)

@@ -19,6 +19,39 @@ def test_angles_that_may_be_degrees():
         lx.assemble(pendulum(forces=[lx.JointSpring("hinge", 2.0)]), {"hinge": 90.0})  # which counts turns
 
 
+LAW = lx.ContactLaw(1e3)
+UNCOUNTED = {
+    "a stop": [lx.JointLimit("hinge", LAW, lower=-100.0, upper=100.0)],
+    "friction": [lx.JointFriction("hinge", 0.1, 0.01), lx.JointDamper("hinge", 0.1), lx.JointTorque("hinge", 1.0)],
+}
+
+
+@pytest.mark.parametrize("forces", UNCOUNTED.values(), ids=UNCOUNTED)
+def test_forces_that_count_no_turns_hide_no_degrees(forces):
+    with pytest.warns(lx.AssemblyWarning, match=r"position of joint 'hinge' is 45 rad.*deg2rad\(45\)"):
+        lx.assemble(pendulum(forces=forces), {"hinge": 45.0})
+
+
+def test_a_law_may_count_turns():
+    law = lambda t, motion: -2.0 * motion.joint("hinge")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lx.assemble(pendulum(forces=[lx.JointTorque("hinge", law)]), {"hinge": 45.0})
+
+
+@pytest.mark.parametrize(
+    ("at", "told"), [(1.2, "ends its range at upper = 1 rad"), (-2.0, "lower = -0.5 rad"), (1.1, "")]
+)
+def test_starts_beyond_a_stop(at, told):
+    """A little beyond it a motion may rest."""
+    limited = pendulum(forces=[lx.JointLimit("hinge", LAW, lower=-0.5, upper=1.0)])
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        lx.assemble(limited, {"hinge": at})
+    assert len(found) == bool(told)
+    assert all(f"'hinge' is at {at:g} rad" in str(each.message) and told in str(each.message) for each in found)
+
+
 def test_struts_of_lengths_of_both_signs():
     """Two struts between a lever and a plate, with nothing to tell which way they point."""
     lever, plate = lx.rod("lever", 1.0, 1.0), lx.box("plate", [1.0, 0.1, 0.1], 1.0)

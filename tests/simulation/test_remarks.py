@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from known_answers import turning
+from mechanisms import pendulum
 from test_step_control import REST, held_weight
 
 import linkax as lx
@@ -33,6 +34,12 @@ def carried(length):
 def held(stiffness):
     """A weight held by a spring: with the program of test_step_control."""
     return lx.simulate(held_weight(stiffness, 0.0), REST, t1=0.5, max_steps=4096)
+
+
+def test_at_a_stop_the_advice_is_one_that_a_stop_can_follow():
+    limit = lx.JointLimit("hinge", lx.ContactLaw(1e8, exponent=1.0, damping=1.0), lower=0.0)
+    with pytest.warns(lx.StiffnessWarning, match="JointLimit on 'hinge'.* take one with less stiffness.*linkax.Impact"):
+        lx.simulate(pendulum(forces=[limit]), lx.State(jnp.zeros(1), jnp.zeros(1)), t1=0.5)
 
 
 def from_angle(angle, speed, gravity, **options):

@@ -88,6 +88,10 @@ class AbstractForce(AbstractElement):
         """Whether all of its work is the fall of its potential energy, whatever its numbers."""
         return False
 
+    def exhausted(self, configuration: Configuration) -> str:
+        """Say why no motion may lead on from a configuration, where a run has failed; an empty string by default."""
+        return ""
+
     def strength(self, t: Time, motion: Motion, *args: Any) -> Any:
         """Compute what `Solution.force` reads: one number, or three in ground axes; takes what `load` takes.
 

@@ -81,6 +81,17 @@ class _Chambers(AbstractForce):
             "b": self.dead_volume + self.area_b * (self.stroke - x),
         }
 
+    def exhausted(self, configuration: Configuration) -> str:
+        x, stroke = float(self.extent(configuration) - self.closed), float(self.stroke)
+        if 0.0 <= x <= stroke:
+            return ""
+        end, past = ("closed", -x) if x < 0.0 else ("closed + stroke", x - stroke)
+        along, *_ = self.units
+        return (
+            f"The piston of {self.display_name} is {past:.3g} {along} beyond its end, {end}, where no oil is left to "
+            "compress; stop it within its stroke, by a linkax.JointLimit, a linkax.Contact or its valve."
+        )
+
     def flows(self, t: Number, motion: Motion, states: States) -> dict[str, Scalar]:
         """Compute the oil that flows into each chamber through the valve, "a" and "b", and from "a" to "b" past the
         piston, "leakage" [m³/s].

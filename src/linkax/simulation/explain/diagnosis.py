@@ -54,6 +54,7 @@ def cause(solution: Solution) -> str:
         return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
     return (
         _no_acceleration(solution, system, method, t)
+        or _exhausted(solution, system, t)
         or _drives(solution, system, t)
         or _ahead(solution, system, t)
         or _contradiction(solution, system, t)
@@ -119,6 +120,13 @@ def _no_acceleration(solution, system, method, t):
     mass = "the mass matrix of the tree is singular"
     why = f"{rank} of the {rows} loop rows are independent" if rank < rows else mass
     return f" The formulation finds no finite acceleration there: {why}. The default formulation needs neither."
+
+
+def _exhausted(solution, system, t):
+    """Say which force element lets no motion lead on from where the run ends."""
+    configuration = configure(system, t, solution.end.q)
+    told = [said for force in solution.mechanism.forces if (said := force.exhausted(configuration))]
+    return f" {told[0]}" if told else ""
 
 
 def _drives(solution, system, t):

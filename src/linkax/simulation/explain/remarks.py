@@ -153,8 +153,10 @@ def _stiff(solution):
     (rates, damping), step = map(np.asarray, _rates(*_ends(solution))), float(_mean_step(solution))
     fastest = int(np.argmax(rates))
     suits_implicit = _suits_implicit(solution, np.asarray, damping)
-    has_states = bool(solution.mechanism.forces[fastest].states)
-    other = "a force without its internal states" if has_states else "a rigid joint or constraint"
+    element = solution.mechanism.forces[fastest]
+    other = "a force without its internal states" if element.states else "a rigid joint or constraint"
+    if element.has_switch:  # it comes and goes, which no constraint does
+        other = "one with less stiffness and damping, or for a stop a linkax.Impact,"
     advice = f"take {other} in its place"
     if _is_implicit(solution) and not suits_implicit:
         advice = "solver=diffrax.Dopri8() takes about as many, each much cheaper"
@@ -164,7 +166,7 @@ def _stiff(solution):
             f"{other} in its place"
         )
     return (
-        f" {solution.mechanism.forces[fastest].display_name}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not "
+        f" {element.display_name}, whose fastest rate is {rates[fastest]:.1e} 1/s, and not "
         f"the motion, chooses the {int(solution.stats['num_steps'])} steps, {step:.1e} s each; {advice}."
     )
 

@@ -2,9 +2,14 @@
 
 from collections.abc import Iterator
 
+import jax
 import numpy as np
 
 from linkax.model.bodies import GROUND_NAME
+from linkax.model.elements import is_own
+from linkax.model.forces.impacts import Impact
+from linkax.model.forces.joint_limits import JointLimit
+from linkax.model.functions import Law
 from linkax.model.joints.bending import OnBeam
 from linkax.model.joints.distance import Distance
 from linkax.model.joints.prismatic import Prismatic
@@ -16,16 +21,18 @@ from linkax.xla.tracing import all_concrete
 
 TURN = 2.0 * np.pi
 DRAWN_APART = 0.01  # of the size of what is drawn
+BEYOND = 0.1  # of a range, or of 1 rad or 1 m of one with one end: deeper than contacts are
 MOST_TURNS = 1.5  # that are given for an angle; ten degrees are more radians than this
 
 
 def doubts(
     mechanism: Mechanism, positions: JointValues, guess: JointValues, speeds: JointValues, state: State
 ) -> Iterator[str]:
-    """Tell of angles that may be degrees, lengths of struts of both signs, joints that are drawn apart, and spins that
-    nothing decides."""
+    """Tell of angles that may be degrees, starts beyond a stop, lengths of struts of both signs, joints that are drawn
+    apart, and spins that nothing decides."""
     yield from _many_turns(mechanism, positions, "position")
     yield from _many_turns(mechanism, guess, "guess")
+    yield from _beyond_stops(mechanism, state)
     if not guess.groups:
         yield from _short_struts(mechanism, positions, state)
         yield from _drawn_apart(mechanism)
@@ -34,8 +41,9 @@ def doubts(
 
 def _many_turns(mechanism, values, what) -> Iterator[str]:
     """Of joints whose turns nothing counts."""
-    elements = (*mechanism.forces, *mechanism.constraints)
-    counted = {name for element in elements for name in element.joints}
+    # A stop bounds turns, and does not count them.
+    forces = [force for force in mechanism.forces if _reads_turns(force) and not isinstance(force, JointLimit | Impact)]
+    counted = {name for element in (*forces, *mechanism.constraints) for name in element.joints}
     for alike, rows in zip(values.groups, values.values, strict=True):
         if alike.kind.has_quaternion or alike.kind.is_screw:
             continue
@@ -46,6 +54,32 @@ def _many_turns(mechanism, values, what) -> Iterator[str]:
                         f"{what} of joint {along.joint!r} is {angle:.6g} rad, which is {abs(angle) / TURN:.3g} turns; "
                         f"if degrees are meant, give numpy.deg2rad({angle:.6g}), else an angle within one turn"
                     )
+
+
+def _reads_turns(force):
+    """Whether a force reads the coordinate of its joint, or may do so."""
+    is_law = lambda node: isinstance(node, Law)
+    return force.needs_coordinate or is_own(force) or any(map(is_law, jax.tree.leaves(force, is_leaf=is_law)))
+
+
+def _beyond_stops(mechanism, state) -> Iterator[str]:
+    """Of joints in the tree that are farther beyond a `JointLimit` than a contact goes."""
+    topology = mechanism.topology
+    for limit in mechanism.forces:
+        if not isinstance(limit, JointLimit) or limit.joint.joint not in topology.coordinates:
+            continue
+        place = limit.range.joint
+        unit = mechanism.joint(place.joint).speed_units[place.index or 0]
+        at = float(state.q[topology.coordinates[place.joint]][place.index or 0])
+        lower, upper = (-np.inf if limit.range.lower is None else float(limit.range.lower)), np.inf
+        upper = upper if limit.range.upper is None else float(limit.range.upper)
+        size = 1.0 if np.isinf(upper - lower) else upper - lower
+        if max(lower - at, at - upper) > BEYOND * size:
+            end, name = (lower, "lower") if at < lower else (upper, "upper")
+            yield (
+                f"joint {place.joint!r} is at {at:.6g} {unit}, and {limit.display_name} ends its range at {name} = "
+                f"{end:.6g} {unit}: it pushes back with the force of so deep a contact; start within the range"
+            )
 
 
 def _short_struts(mechanism, positions, state) -> Iterator[str]:
