@@ -10,6 +10,7 @@ from known_answers import mechanism_of
 from mechanisms import POOL
 
 import linkax as lx
+from linkax.simulation.read.solution import drawn
 from linkax.tables import MOST_ROWS, SMALL, Rows, Table, numbers
 
 
@@ -25,7 +26,7 @@ def test_a_state_names_joints_with_units():
     text = repr(lx.State(jnp.stack([state.q] * 3), jnp.arange(3.0)[:, None] * jnp.ones(3), mechanism.topology))
     assert "a batch of 3" in text
     assert "0 to 2 rad/s" in text
-    assert "bearing" in repr(lx.Solution.of_state(mechanism, lx.State(state.q, state.v)).end)
+    assert "bearing" in repr(drawn(mechanism, lx.State(state.q, state.v)).end)
     assert "bearing" not in repr(lx.State(state.q, state.v))
 
 
@@ -52,7 +53,7 @@ def test_what_is_traced_or_missing_shows_shapes():
     assert "f64[3]" in of_state
     assert "P1" in of_state
     assert "f64[3]" in of_reaction
-    for tree in (mechanism, state, lx.Reaction(state.q, state.q), lx.Solution.of_state(mechanism, state)):
+    for tree in (mechanism, state, lx.Reaction(state.q, state.q), drawn(mechanism, state)):
         shapes = eqx.filter_eval_shape(lambda tree: tree, tree)
         for broken in (shapes, jax.tree.map(lambda _: None, tree), jax.tree.map(lambda _: object(), tree)):
             assert type(tree).__name__ in repr(broken)

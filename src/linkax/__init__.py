@@ -62,6 +62,7 @@ from linkax.model.bodies import Frame as Frame  # noqa: E402
 from linkax.model.bodies import RigidBody as RigidBody  # noqa: E402
 from linkax.model.bodies import box as box  # noqa: E402
 from linkax.model.bodies import point_mass as point_mass  # noqa: E402
+from linkax.model.calls import explain_slips  # noqa: E402
 from linkax.model.constraints.constraint import AbstractConstraint as AbstractConstraint  # noqa: E402
 from linkax.model.constraints.constraint import Coupling as Coupling  # noqa: E402
 from linkax.model.constraints.constraint import Drive as Drive  # noqa: E402
@@ -225,5 +226,6 @@ def __dir__() -> list[str]:
     return sorted({*here, *_LATER})
 
 
-del jax, set_flags, watch_memory_maps
+globals().update(explain_slips({name: entry for name, entry in globals().items() if name in __dir__()}))
+del explain_slips, jax, set_flags, watch_memory_maps
 __all__ = __dir__()  # pyright: ignore[reportUnsupportedDunderAll]

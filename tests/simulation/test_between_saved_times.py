@@ -116,8 +116,9 @@ def test_bad_times_are_named(top):
         solution.at([0.1, 1.2])
     with pytest.raises(ValueError, match="must be finite"):
         solution.at([0.1, np.nan])
-    with pytest.raises(ValueError, match=r"times \[s\] have shape \(\); give \(n,\) times"):
-        solution.at(0.5)
+    with pytest.raises(ValueError, match=r"times \[s\] have shape \(1, 1\); give \(n,\) times"):
+        solution.at([[0.5]])
+    np.testing.assert_array_equal(solution.at(0.5).q, solution.at([0.5]).q)
     alone = lx.Solution.of_state(solution.mechanism, solution.end)
     with pytest.raises(ValueError, match="has one time, and no motion between"):
         alone.at([0.0])

@@ -313,7 +313,8 @@ class Walk:
     def _read(self, space: Any) -> Any:
         """Find the key of attributes of a module, class or instance that code names, or calls as operators."""
         spaces = [base for base in space.__mro__ if not is_library(base)] if isinstance(space, type) else [space]
-        reads_all = _ALL in self._attributes or hasattr(space, "__getattr__")
+        owners = [base for base in type(space).__mro__ if not is_library(base)] if spaces == [space] else spaces
+        reads_all = _ALL in self._attributes or any("__getattr__" in vars(owner) for owner in (*owners, *spaces))
         found = {}
         for entries in map(vars, reversed(spaces)):
             for name, value in list(entries.items()):

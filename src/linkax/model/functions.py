@@ -81,7 +81,8 @@ def check_unchanged(what: str, code: Code) -> None:
     """Raise a `ValueError` where what code reads has changed since the mechanism was built."""
     if code.has_changed():
         raise ValueError(
-            f"{what} ({', '.join(code.variables)}) has changed since the mechanism was built; build the mechanism anew"
+            f"{what} ({', '.join(code.variables)}) has changed since the mechanism was built; build it anew, or "
+            "where it changes that itself, take that out"
         )
 
 

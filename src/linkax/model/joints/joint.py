@@ -83,6 +83,10 @@ class AbstractJoint(eqx.Module):
     speed_units: ClassVar[tuple[str, ...]]
     # Coordinates begin with a unit quaternion, whose rate is the angular velocity of the first three speeds.
     has_quaternion: ClassVar[bool] = False
+    _elsewhere: ClassVar[str] = (
+        "; its motion and loads are read by its name, as in solution.joint(name) and solution.reaction(name), and a "
+        "torque or force along it is a linkax.JointTorque"
+    )
     # False for a type that only closes loops.
     can_carry: ClassVar[bool] = True
 

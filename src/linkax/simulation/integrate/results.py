@@ -1,5 +1,6 @@
 """How a run ended, in names and words; its errors and warnings."""
 
+import warnings
 from typing import Any
 
 import diffrax
@@ -13,51 +14,56 @@ from linkax.xla.enumerations import code
 Solution = Any  # a `linkax.Solution`, of a higher layer
 
 
-class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  Equinox lets enumerations be extended
-    """`diffrax.RESULTS`, and what can go wrong with a mechanism."""
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # Equinox's, that diffrax has no words for this
 
-    not_closed = (
-        "The loops of the initial state do not close. Make the state with `linkax.assemble`, which says which "
-        "joint is open, and how far."
-    )
-    not_assembled = (
-        "The loops cannot be closed with the positions and speeds that `linkax.assemble` was given. Outside of JAX "
-        "transformations it says which joint is open, and how far."
-    )
-    no_branch = (
-        "The initial configuration is singular, and the initial speeds lie on no branch of the motion. Make the state "
-        "with `linkax.assemble`, which finds speeds on a branch."
-    )
-    not_unique = (
-        "The mechanism starts at rest in a singular configuration, and the forces drive it along no single branch: "
-        "its motion is not unique. Give it speeds, or start a little along the branch it should take."
-    )
-    massless = (
-        "Bodies without mass, or without inertia, can move freely, so that no acceleration follows from the forces on "
-        "them. Give them mass and inertia, or a joint that holds them."
-    )
-    diverged = (
-        "A step of fixed size led to numbers that are not finite, or far off the loops. Take smaller steps, or let the "
-        "step size adapt."
-    )
-    times_out_of_order = (
-        "The times of the run make no sense: t1, saved times and dt0 must be finite, t1 after t0, and saved times in "
-        "rising order between them."
-    )
-    not_finite = (
-        "The initial state, the numbers of the mechanism, or its forces there are not finite, or a number is outside "
-        "of what it can be, such as a negative length; give finite ones. Outside of JAX transformations such a "
-        "mechanism is refused, by an error that names the number."
-    )
-    off_loops = (
-        "A state between two steps lies off the loops, and no state that closes them is near: the steps are too long "
-        "there. Ask for a smaller rtol, or take smaller steps."
-    )
-    rests_on_stop = (
-        "The motion comes to rest on the stop of a `linkax.Impact`, after bounces that follow each other ever faster, "
-        "or begins beyond it. Take a `linkax.JointLimit` or a `linkax.Contact`, which holds it, or end the run before."
-    )
-    not_reached = "The branch does not lead to all values: it turns back before, or ends where another one crosses."
+    class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  Equinox lets enumerations be extended
+        """`diffrax.RESULTS`, and what can go wrong with a mechanism."""
+
+        successful = "The run reached its end."
+        not_closed = (
+            "The loops of the initial state do not close. Make the state with `linkax.assemble`, which says which "
+            "joint is open, and how far."
+        )
+        not_assembled = (
+            "The loops cannot be closed with the positions and speeds that `linkax.assemble` was given. Outside of "
+            "JAX transformations it says which joint is open, and how far."
+        )
+        no_branch = (
+            "The initial configuration is singular, and the initial speeds lie on no branch of the motion. Make the "
+            "state with `linkax.assemble`, which finds speeds on a branch."
+        )
+        not_unique = (
+            "The mechanism starts at rest in a singular configuration, and the forces drive it along no single "
+            "branch: its motion is not unique. Give it speeds, or start a little along the branch it should take."
+        )
+        massless = (
+            "Bodies without mass, or without inertia, can move freely, so that no acceleration follows from the "
+            "forces on them. Give them mass and inertia, or a joint that holds them."
+        )
+        diverged = (
+            "A step of fixed size led to numbers that are not finite, or far off the loops. Take smaller steps, or let "
+            "the step size adapt."
+        )
+        times_out_of_order = (
+            "The times of the run make no sense: t1, saved times and dt0 must be finite, t1 after t0, and saved times"
+            " in rising order between them."
+        )
+        not_finite = (
+            "The initial state, the numbers of the mechanism, or its forces there are not finite, or a number is "
+            "outside of what it can be, such as a negative length; give finite ones. Outside of JAX transformations "
+            "such a mechanism is refused, by an error that names the number."
+        )
+        off_loops = (
+            "A state between two steps lies off the loops, and no state that closes them is near: the steps are too "
+            "long there. Ask for a smaller rtol, or take smaller steps."
+        )
+        rests_on_stop = (
+            "The motion comes to rest on the stop of a `linkax.Impact`, after bounces that follow each other ever "
+            "faster, or begins beyond it. Take a `linkax.JointLimit` or a `linkax.Contact`, which holds it, or end "
+            "the run before."
+        )
+        not_reached = "The branch does not lead to all values: it turns back before, or ends where another one crosses."
 
 
 KNOWN_RESULTS = (
@@ -102,7 +108,7 @@ def remark_name(remark: "REMARKS") -> str:
 class REMARKS(eqx.Enumeration):
     """Remarks on a run that ended well; a single run warns of the first that applies."""
 
-    none = ""
+    none = "There is nothing to say of the run."
     rounding = (
         "Rounding alone puts accelerations off by more than the tolerance: a body carries one far larger, or very "
         "many. Ask for a larger rtol, or cut a joint so that another body carries it."
@@ -117,8 +123,8 @@ class REMARKS(eqx.Enumeration):
     )
     stiff = (
         "A stiff spring, damper or beam, or a fast internal state of a force element, and not the motion, chooses the "
-        "steps. Take a rigid joint or constraint in its place, or a force without that state; or with an explicit "
-        "solver, where it comes to rest, solver=linkax.Rodas5P()."
+        "steps. Take a rigid joint or constraint in its place, or a force without that state; of a contact or stop one "
+        "less stiff, or a linkax.Impact; or with an explicit solver, where it comes to rest, solver=linkax.Rodas5P()."
     )
 
 

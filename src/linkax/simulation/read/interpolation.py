@@ -20,14 +20,14 @@ from linkax.xla.undefined import infinite_where
 ROUNDING = 1e-9  # of the time between the first and the last saved one: how far beyond them a time may lie
 
 
-def motion_at(solution: Solution, ts: Vector | list[Number]) -> Solution:
+def motion_at(solution: Solution, ts: Number | Vector | list[Number]) -> Solution:
     """The same motion at other times; see `Solution.at`.
 
     **Raises:** `ValueError` for times that are not those of the motion, and for a solution of one time.
     """
     what, shape = "times [s]", solution.ts.shape
-    times = jnp.asarray(real(ts, what))
-    if times.ndim == 0 or times.shape[:-1] not in ((), shape[:-1]):
+    times = jnp.atleast_1d(jnp.asarray(real(ts, what)))
+    if times.shape[:-1] not in ((), shape[:-1]):
         batch = f", or {(*shape[:-1], 'n')} of a batch" if shape[:-1] else ""
         raise ValueError(f"{what} have shape {times.shape}; give (n,) times{batch}")
     if shape[-1] < 2:

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -79,6 +79,10 @@ class Solution(Kinematics):
     All that is read by the methods below comes as arrays with times as the first axis, in ground
     axes and SI units. A solution from `jax.vmap` has the batch axes before that.
     """
+
+    _elsewhere: ClassVar[str] = (
+        "; what a force element does is its force(element), what a joint carries its reaction(joint)"
+    )
 
     run: Run
     ts: Float[Array, "*batch n_t"] | Any
@@ -357,7 +361,7 @@ class Solution(Kinematics):
         """
         save(self, path)
 
-    def at(self, ts: Vector | list[Number]) -> "Solution":
+    def at(self, ts: Number | Vector | list[Number]) -> "Solution":
         """The same motion at other times between the saved ones, to be read as this one.
 
         Between two saved times the motion is a polynomial of degree five through q, q̇ and q̈ at both. Coordinates are
@@ -367,7 +371,8 @@ class Solution(Kinematics):
         jumps between saved times, the error falls with the second power alone. Derivatives by `ts` are those of the
         polynomial.
 
-        **Arguments:** `ts`: times in any order, (n,) [s]; (*batch, n) for times of its own of each member of a batch.
+        **Arguments:** `ts`: a time [s], or times in any order, (n,); (*batch, n) for times of its own of each member of
+        a batch.
 
         **Returns:** a `Solution` at these times. Inside of JAX transformations, where times are not known, one outside
         of the saved ones is infinite, as one that was not reached.
