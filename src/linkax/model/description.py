@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from linkax.model.beams import BeamElasticity
 from linkax.model.bodies import GROUND_NAME, Frame
 from linkax.model.functions import Law
 from linkax.model.joints.bending import BeamSegment, OnBeam
@@ -42,7 +43,9 @@ def described(mechanism: Mechanism) -> Table:
     hidden = lambda joint: isinstance(joint, BeamSegment) or between(joint.name)
     joints = [(joint, role) for joint, role in zip(mechanism.joints, roles, strict=True) if not hidden(joint)]
     forces = [
-        pair for pair in zip(mechanism.force_names, mechanism.forces, strict=True) if not hasattr(pair[1], "beam")
+        pair
+        for pair in zip(mechanism.force_names, mechanism.forces, strict=True)
+        if not isinstance(pair[1], BeamElasticity)
     ]
     title = f"Mechanism of {', '.join(_counts(mechanism, bodies, joints, forces))}"
     masses = [known(body.mass) for body in mechanism.bodies]

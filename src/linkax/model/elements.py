@@ -1,7 +1,8 @@
 """What forces and constraints share: the joints that they act along, the frames that they attach to."""
 
 import abc
-from typing import Any
+import inspect
+from typing import Any, ClassVar
 
 import equinox as eqx
 
@@ -21,8 +22,47 @@ def is_own(element: Any) -> bool:
     return not type(element).__module__.startswith("linkax.")
 
 
-class AbstractElement(eqx.Module):
+class OpenToUsers(eqx.Module):
+    """A class of linkax that users may derive from; their classes must not take names that it has for itself.
+
+    - `_open`: names that a user's class may define, besides new ones.
+    """
+
+    _open: ClassVar[frozenset[str]] = frozenset()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """**Raises:** `TypeError` for a name of a user's class that linkax has for itself, and for a field that is a
+        method or property there.
+        """
+        super().__init_subclass__(**options)
+        if _is_linkax(cls):
+            return
+        annotations = inspect.get_annotations(cls)
+        fields = {name for name, annotation in annotations.items() if "ClassVar" not in str(annotation)}
+        for name in sorted(name for name in {*vars(cls), *annotations} if not name.startswith("__")):
+            bases = [base for base in cls.__mro__ if _is_linkax(base) and name in vars(base)]
+            for base in bases:
+                own = vars(base)[name]
+                if name not in vars(base).get("_open", {name}):
+                    raise TypeError(
+                        f"{cls.__name__} defines {name!r}, which {base.__name__} has for itself; give it another name"
+                    )
+                is_other = name in fields or not (callable(vars(cls)[name]) or isinstance(own, property))
+                if is_other and (inspect.isfunction(own) or isinstance(own, property)):
+                    raise TypeError(
+                        f"{cls.__name__} has a field {name!r}, and {base.__name__} a method or property of that name; "
+                        "define such a one, or give the field another name"
+                    )
+
+
+def _is_linkax(kind):
+    return kind.__module__.startswith("linkax.")
+
+
+class AbstractElement(OpenToUsers):
     """A force element or a constraint."""
+
+    _open = frozenset({"name", "terms", "frames", "joints", "extent", "display_name"})
 
     @property
     def terms(self) -> tuple[Term, ...]:

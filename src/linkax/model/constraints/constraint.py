@@ -41,6 +41,8 @@ class AbstractConstraint(AbstractElement):
     - `is_driven`: whether the residual depends on time.
     """
 
+    _open = AbstractElement._open | {"units", "slip_units", "is_driven", "residual", "slip"}
+
     units: ClassVar[tuple[str, ...]] = ("m",)
     slip_units: ClassVar[tuple[str, ...]] = ()
     is_driven: ClassVar[bool] = False

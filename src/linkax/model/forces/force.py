@@ -58,6 +58,11 @@ class AbstractForce(AbstractElement):
     `potential_energy(configuration, states)`. They are integrated with the motion, see `Solution.states`.
     """
 
+    _open = AbstractElement._open | {
+        "states", "rates", "load", "switch", "has_switch", "strength", "potential_energy", "needs_coordinate",
+        "conserves_energy", "exhausted",
+    }  # fmt: skip
+
     @property
     def states(self) -> Mapping[str, InternalState]:
         """Internal states by name, each a `linkax.InternalState`; none by default."""

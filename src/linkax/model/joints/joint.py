@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
+from linkax.model.elements import OpenToUsers
 from linkax.model.functions import MISTAKES, of_element
 from linkax.model.numbers import Axis, Constant, perpendicular_axes, require_bool, unit_axis, value
 from linkax.model.terms import Term
@@ -66,7 +67,7 @@ class JointKind:
         return self.motion.has_quaternion
 
 
-class AbstractJoint(eqx.Module):
+class AbstractJoint(OpenToUsers):
     """A joint between a frame on a parent and a frame on a child body. To make your own, define `transform`.
 
     Both frames have the same orientation at coordinate zero. The joint's axes h¹, h², h³ are fixed in each of
@@ -83,6 +84,10 @@ class AbstractJoint(eqx.Module):
     speed_units: ClassVar[tuple[str, ...]]
     # Coordinates begin with a unit quaternion, whose rate is the angular velocity of the first three speeds.
     has_quaternion: ClassVar[bool] = False
+    _open = frozenset(
+        {"speed_units", "has_quaternion", "can_carry", "transform", "length_estimate", "angular_subspace"}
+        | {"linear_subspace", "name", "parent", "child", "axis", "second_axis", "cut"}
+    )
     _elsewhere: ClassVar[str] = (
         "; its motion and loads are read by its name, as in solution.joint(name) and solution.reaction(name), and a "
         "torque or force along it is a linkax.JointTorque"

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float
 
+from linkax.model.elements import OpenToUsers
 from linkax.model.forces.force import Gravity
 from linkax.model.joints.distance import Distance
 from linkax.model.numbers import (
@@ -52,7 +53,7 @@ def _components(entry) -> tuple[int, ...] | int | None:
     return tuple(whole_number(part, "a sensor's component", least=0) for part in entry)
 
 
-class AbstractSensor(eqx.Module):
+class AbstractSensor(OpenToUsers):
     """An instrument that tells gain × reading(t − delay) + bias, and noise.
 
     A sensor type is a subclass with a `reading`. Gain, bias and delay are numbers, known or parameters of a fit.
@@ -69,6 +70,8 @@ class AbstractSensor(eqx.Module):
 
     **Raises:** `ValueError` for numbers that are not finite, noise that is not positive, and an unknown loss.
     """
+
+    _open = frozenset({"gain", "bias", "delay", "noise", "loss", "components", "reading", "reading_between"})
 
     gain: Float[Array, "..."] = eqx.field(
         default=1.0, kw_only=True, converter=partial(_numbers, what="a sensor's gain")
