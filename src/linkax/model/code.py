@@ -6,17 +6,20 @@ and the values that they close over and read as globals are equal. JAX arrays th
 are taken out. One that reads what cannot be compared is refused: that it has changed would not be seen.
 """
 
+import functools
 import sys
 import types
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from linkax.model.code_walk import Key, Maker, NotComparable, NotMadeAgain, Same, Walk, is_library
 from linkax.xla.descriptions import Undescribed, description
+
+Tree = TypeVar("Tree")
 
 
 class Code(Key):
@@ -48,7 +51,7 @@ class Code(Key):
         return code, tuple(array if isinstance(array, jax.Array) else jnp.array(array) for array in numbers)
 
     @staticmethod
-    def _walked(function, names):
+    def _walked(function, names, has_numbers=True):
         code, walk = Code(), Walk(names)
         code.function, code._names = function, tuple(names)
         try:
@@ -56,6 +59,8 @@ class Code(Key):
             while True:
                 known, walk = walk.names, Walk(walk.names)
                 try:
+                    if not has_numbers:
+                        raise NotMadeAgain
                     code._key, code._made = walk.part(function, not isinstance(function, types.FunctionType))
                 except NotMadeAgain:  # with its numbers in the key
                     walk = Walk(known)
@@ -89,6 +94,41 @@ class Code(Key):
             return True
         held = zip(self._arrays, numbers, strict=False)
         return now != self or any(ref is not None and ref() is not number for ref, number in held)
+
+
+class ByValue:
+    """A function compared by its code and by all that it reads, numbers included, where JAX compares by identity.
+
+    One that reads what cannot be compared equals itself alone, and so is traced anew wherever this is made anew.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        functools.update_wrapper(self, function, updated=())
+        self._function = function
+        try:
+            self._code, _, keeping = Code._walked(function, (), has_numbers=False)
+        except NotComparable:
+            self._code, keeping = object(), []
+        for kept in keeping:
+            _renew(kept)
+
+    @staticmethod
+    def each(tree: Tree) -> Tree:
+        """All functions among the leaves of a pytree as such; a function itself is a leaf."""
+        is_function = lambda leaf: callable(leaf) and not isinstance(leaf, type)
+        return jax.tree.map(lambda leaf: ByValue(leaf) if is_function(leaf) else leaf, tree)
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        return self._function(*args, **options)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ByValue) and self._code == other._code
+
+    def __hash__(self) -> int:
+        return hash(self._code)
+
+    def __reduce__(self) -> tuple:
+        return ByValue, (self._function,)
 
 
 _first: weakref.WeakKeyDictionary[Any, Code] = weakref.WeakKeyDictionary()

@@ -10,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
+from linkax.model.code import ByValue
 from linkax.model.numbers import number, one_of, require, require_type, whole_number
 from linkax.studies.fits.design_result import Design
 from linkax.studies.fits.fit import check_output
@@ -234,6 +235,7 @@ def design(
     """
     kinds = Callable | Experiment | list | tuple
     require_type(predictions, kinds, "predictions", "give a function of (params, design), or experiments")
+    predictions, limits = ByValue.each((predictions, limits))
     if not callable(predictions):
         predictions = _Planned(Experiments.of(checked_experiments(predictions)))
     if limits is not None:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from linkax.model.code import ByValue
 from linkax.model.numbers import number, require, require_type, whole_number
 from linkax.studies.fits.fit_result import Fit, Starts
 from linkax.studies.fits.fit_search import (
@@ -105,7 +106,7 @@ def fit(
     require_type(
         function, kinds, "function", "give a residual or a loss, a function of (params, *args), or experiments"
     )
-    free = FreeParameters.of(params)
+    function, free = ByValue.each(function), FreeParameters.of(params)
     require_type(args, list | tuple, "args", "give a tuple of what else the function gets")
     data = as_arrays(tuple(args), "args")
     _check_ending(steps, tolerance, patience)

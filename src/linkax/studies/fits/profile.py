@@ -10,6 +10,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float
 
+from linkax.model.code import ByValue
 from linkax.model.numbers import is_finite, number, real, require, require_type, whole_number
 from linkax.studies.fits.fit_result import Fit
 from linkax.studies.fits.fit_search import Squares, search_from_each, sensitivity
@@ -79,6 +80,7 @@ def profile(
     """
     kinds = Callable | Experiment | list | tuple
     require_type(function, kinds, "function", "give what was fitted, a function of (params, *args) or experiments")
+    function = ByValue.each(function)
     require_type(found, Fit, "found", "give what linkax.fit returned")
     spread = found.determined()
     if not spread.noise > 0.0:

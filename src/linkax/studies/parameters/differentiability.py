@@ -16,6 +16,7 @@ from linkax.analysis.mobility import row_names
 from linkax.equations.configuration import configure
 from linkax.equations.loops import immobile_residual, jacobian, residual
 from linkax.equations.system import system_of
+from linkax.model.code import ByValue
 from linkax.model.numbers import require_type
 from linkax.simulation.integrate.results import ENDED_WELL, result_name
 from linkax.simulation.read.passages import singular_states
@@ -69,7 +70,7 @@ def differentiability(function: Callable[[Any], Solution], params: Any) -> Diffe
     **Raises:** `ValueError` for a function that returns no `Solution`, a batch, or the solution of a run that failed,
     and for saved times too far apart to show singular configurations.
     """
-    require_type(function, Callable, "function", "give a function that returns a linkax.Solution")
+    function = ByValue.each(require_type(function, Callable, "function", "give a function that returns a Solution"))
     free = FreeParameters.of(params)
     solution = function(free.params(free.start))
     if not isinstance(solution, Solution):

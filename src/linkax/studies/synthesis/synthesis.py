@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.analysis.trace import Trace
+from linkax.model.code import ByValue
 from linkax.model.numbers import number, require, require_bool, require_type, whole_number
 from linkax.simulation.integrate.results import RESULTS
 from linkax.studies.fits.fit_search import Squares, search_from_each
@@ -73,7 +74,8 @@ def synthesis(
     **Raises:** `ValueError` for other parameters; for a function that returns no `Candidate`, or whose trace is a
     batch; and where no start is possible.
     """
-    require_type(function, Callable, "function", "give a function of params that returns a linkax.Candidate")
+    remedy = "give a function of params that returns a linkax.Candidate"
+    function = ByValue.each(require_type(function, Callable, "function", remedy))
     for leaf in jax.tree.leaves(params, is_leaf=lambda node: isinstance(node, Bounded)):
         require_type(leaf, Bounded, "params", "give all between bounds, such as linkax.Bounded(1.0, 0.5, 2.0)")
     whole_number(starts, "starts")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from linkax.model.code import ByValue
 from linkax.model.numbers import require_bool, require_type, whole_number
 from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS
 from linkax.simulation.read.solution import Solution
@@ -83,7 +84,7 @@ def tolerance_analysis(
 
     **Warns:** as `linkax.sweep` does.
     """
-    require_type(function, Callable, "function", "give a function of parameters")
+    function = ByValue.each(require_type(function, Callable, "function", "give a function of parameters"))
     whole_number(order, "order", most=2)
     whole_number(seed, "seed", least=0)
     read = Deviations.of(params, deviations, correlation)
