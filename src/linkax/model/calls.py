@@ -5,7 +5,7 @@ import functools
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 
@@ -23,10 +23,11 @@ def explain_slips(public: Mapping[str, Any]) -> dict[str, Callable[..., Any]]:
             functions[name] = _explaining(entry, entry.__name__, 0)
             setattr(sys.modules[entry.__module__], entry.__name__, functions[name])
         elif inspect.isclass(entry):
-            if inspect.isfunction(vars(entry).get("__init__")):
-                entry.__init__ = _explaining(entry.__init__, entry.__name__, 1)
-            if issubclass(entry, eqx.Module):
-                entry.__getattr__ = _lacking
+            kind, is_module = cast(Any, entry), issubclass(entry, eqx.Module)
+            if inspect.isfunction(vars(kind).get("__init__")):
+                kind.__init__ = _explaining(kind.__init__, kind.__name__, 1)
+            if is_module:
+                kind.__getattr__ = _lacking
     return functions
 
 

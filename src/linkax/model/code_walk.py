@@ -54,9 +54,9 @@ class Same(Key):
 
 _ATOMS = (type(None), bool, int, float, complex, str, bytes, type(...), range)
 # What keeps results of a function, or what was traced of it.
-_KEEPING = (type(jax.jit(abs)), type(eqx.filter_jit(abs)), type(functools.cache(abs)))
+_KEEPING: tuple[Any, ...] = (type(jax.jit(abs)), type(eqx.filter_jit(abs)), type(functools.cache(abs)))
 # Compared by identity, as JAX does, and by the functions that they are made of.
-_OPAQUE = (*_KEEPING, np.ufunc, type(np.dot), jnp.ufunc, jax.custom_jvp, jax.custom_vjp, Enum)
+_OPAQUE: tuple[Any, ...] = (*_KEEPING, np.ufunc, type(np.dot), jnp.ufunc, jax.custom_jvp, jax.custom_vjp, Enum)
 _OPAQUE += (types.MemberDescriptorType, types.GetSetDescriptorType)
 _MADE_OF = ("__wrapped__", "jvp", "fwd", "bwd")
 _BASES = (object, abc.ABC, typing.Generic, typing.Protocol, types.SimpleNamespace)
@@ -312,8 +312,9 @@ class Walk:
 
     def _read(self, space: Any) -> Any:
         """Find the key of attributes of a module, class or instance that code names, or calls as operators."""
-        spaces = [base for base in space.__mro__ if not is_library(base)] if isinstance(space, type) else [space]
-        owners = [base for base in type(space).__mro__ if not is_library(base)] if spaces == [space] else spaces
+        is_class = isinstance(space, type)
+        owners = [base for base in (space if is_class else type(space)).__mro__ if not is_library(base)]
+        spaces = owners if is_class else [space]
         reads_all = _ALL in self._attributes or any("__getattr__" in vars(owner) for owner in (*owners, *spaces))
         found = {}
         for entries in map(vars, reversed(spaces)):
