@@ -149,9 +149,9 @@ class Solution(Kinematics):
     ) -> "Solution":
         """A solution of one time, to read reactions, energies or accelerations at a `State` on the closed loops.
 
-        **Raises:** `ValueError` for a state off the loops, in positions or in speeds. Inside JAX transformations, its
-        `result` tells so, and of a state that `linkax.assemble` did not find. A classical formulation may leave loops
-        open.
+        **Raises:** `ValueError` for a state off the loops, in positions or in speeds; one at rest, as drawn, may lack
+        the speeds that drives ask for, and a classical formulation may leave loops open. Inside JAX transformations,
+        its `result` tells so, and of a state that `linkax.assemble` did not find.
         """
         state, method = checked_state(mechanism, state), checked_formulation(formulation, accuracy)
         check_accuracy(accuracy)

@@ -70,7 +70,8 @@ class InitialCheck(NamedTuple):
 class OffLoops(NamedTuple):
     """How far a state is off the closed loops.
 
-    - `gap`: the widest, in radians and lengths of the mechanism. `miss`: of J v = b, relative to the largest speed.
+    - `gap`: the widest, in radians and lengths of the mechanism.
+    - `miss`: of J v = b, relative to the largest speed; zero at rest, as drawn, whatever speeds drives ask for.
     """
 
     gap: Float[Array, ""]
@@ -92,10 +93,8 @@ def off_loops(flat: Flat[Mechanism], t: Float[Array, ""], state: State) -> OffLo
     """How far a state at time t [s] is off the closed loops, in positions and in speeds."""
     system = system_of(flat, state.q.dtype)
     configuration = configure(system, t, state.q)
-    asked = rate(configuration)
-    miss = largest(jacobian(configuration) @ state.v - asked)
-    fastest = jnp.maximum(system.fastest(state.v), largest(asked))
-    return OffLoops(gaps(configuration).in_scales(system).widest(), ratio(miss, fastest, 0.0))
+    miss = largest(jacobian(configuration) @ state.v - rate(configuration))
+    return OffLoops(gaps(configuration).in_scales(system).widest(), ratio(miss, system.fastest(state.v), 0.0))
 
 
 def is_assembled(state: State) -> Bool[Array, ""]:
