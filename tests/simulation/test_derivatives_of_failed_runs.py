@@ -13,13 +13,16 @@ READINGS = {
     "joint": lambda run: run.joint("hinge")[-1],
     "position": lambda run: run.position("arm")[-1, 0],
     "energy": lambda run: run.energy()[-1],
+    "reaction": lambda run: run.reaction("hinge").force[-1, 0],
+    "work": lambda run: run.work()["damper"][-1],
     "end": lambda run: run.end.q[0],
 }
 
 
 def failed(length, **options):
     start = lx.State(jnp.zeros(1), jnp.zeros(1))
-    return lx.simulate(pendulum(length), start, t1=5.0, max_steps=5, throw=False, **options)
+    arm = pendulum(length, forces=[lx.JointDamper("hinge", 0.1, name="damper")])
+    return lx.simulate(arm, start, t1=5.0, max_steps=5, throw=False, **options)
 
 
 @pytest.mark.parametrize("read", READINGS.values(), ids=READINGS)

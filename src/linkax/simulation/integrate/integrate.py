@@ -241,8 +241,8 @@ def _closed(
         reached, jax.tree.map(lambda rows: rows[0], closed), holds[0] & jnp.all(holds_later), fails_at
     )
     missing = jnp.logical_not(saved & (jnp.cumsum(~holds_later) == 0))
-    reached = reached._replace(ts=jnp.where(missing, jnp.inf, ts))
-    return reached, end, infinite_where(missing, jax.tree.map(each, closed), values)
+    ts, saved = infinite_where(missing, (ts, jax.tree.map(each, closed)), (ts, values))
+    return reached._replace(ts=ts), end, saved
 
 
 def _checked(reached, end, holds, fails_at):

@@ -38,7 +38,7 @@ def work(solution: Solution) -> dict[str, Float[Array, "*batch n_t"]]:
             if isinstance(force, Impact)
         ]
         taken = solution.impact_record[..., 1, :]
-        since = jnp.where(jnp.isfinite(taken), taken[..., :1, :] - taken, jnp.inf)
+        since = jnp.where(jnp.isfinite(taken), taken[..., :1, :] - taken, jnp.inf + solution.ts[..., None])
         names, works = [*names, *stops], [*works, *jnp.moveaxis(since, -1, 0)]
     return ByName(dict(zip(names, works, strict=True)), "element that does work")
 
@@ -51,4 +51,4 @@ def _integrals(ts, powers):
     at_places = powers.reshape(*powers.shape[:-1], span.shape[-1], len(PLACES))
     each = jnp.where(span[..., None] > 0.0, at_places, 0.0) @ jnp.asarray(WEIGHTS, ts.dtype) * span
     found = jnp.concatenate([jnp.zeros_like(powers[..., :1]), jnp.cumsum(each, axis=-1)], axis=-1)
-    return jnp.where(jnp.isfinite(ts), found, jnp.inf)
+    return jnp.where(jnp.isfinite(ts), found, ts)
