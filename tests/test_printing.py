@@ -171,7 +171,8 @@ def test_fits_and_sweeps():
     params, names = {"mass": np.array(2.0), "rod": np.array(1.5)}, ["mass", "rod"]
     common = {"params": params, "loss": 0.1, "residual": None, "names": names, "history": {}, "steps": 3}
     covariance = np.diag([np.inf, 0.04])
-    fit = lx.Fit(**common, covariance=covariance, noise=0.5, undetermined=["mass"], ended="converged", spread=None)
+    ended = {"ended": "converged", "spread": None}
+    fit = lx.Fit(**common, **ended, covariance=covariance, noise=0.5, undetermined=["mass"], on_bound={})
     title, _, mass, rod = repr(fit).splitlines()
     assert "converged after 3 steps" in title
     assert "not determined" in mass

@@ -167,7 +167,7 @@ CASES = {
     "Accuracy: clearance": (lambda x: lx.Accuracy(clearance=x), 0.0, NOT_NEGATIVE),
     "Baumgarte": (lambda x: lx.Baumgarte(x, 1.0), 0.0, NOT_NEGATIVE),
     "Positive": (lx.Positive, np.ones(2), [[1.0, 0.0], [1.0, np.inf]]),
-    "Bounded": (lambda x: lx.Bounded(x, 0.0, 1.0), 0.5, [*POSITIVE, 2.0]),
+    "Bounded": (lambda x: lx.Bounded(x, 0.0, 1.0), 0.0, [*NOT_NEGATIVE, 2.0]),
     "PhysicalInertia": (lambda x: lx.PhysicalInertia(1.0, inertia=x), np.ones(3), [[1.0, 1.0, 2.0], [1.0, 1.0, -1.0]]),
 }  # fmt: skip
 

@@ -77,8 +77,8 @@ def test_a_checkpoint_that_cannot_be_written_is_named(tmp_path):
 NO_NUMBER = [np.nan, np.inf, None, "one", 1.0j, True]
 PARAMETERS = {
     "Positive": (lx.Positive, [0.0, -1.0, [1.0, -1.0], [1.0, np.nan], *NO_NUMBER]),
-    "Bounded": (lambda value: lx.Bounded(value, 0.0, 1.0), [0.0, 1.0, -1.0, 2.0, [0.5, 3.0], *NO_NUMBER]),
-    "Bounded: ": (lambda bound: lx.Bounded(0.5, bound, 1.0), [0.5, 2.0, *NO_NUMBER]),
+    "Bounded": (lambda value: lx.Bounded(value, 0.0, 1.0), [-1e-9, -1.0, 2.0, [0.5, 3.0], *NO_NUMBER]),
+    "Bounded: ": (lambda bound: lx.Bounded(1.0, bound, 1.0), [1.0, 2.0, *NO_NUMBER]),
     "Normal": (lambda deviation: lx.Normal(0.0, deviation), [0.0, -1.0, *NO_NUMBER]),
     "LogNormal": (lambda median: lx.LogNormal(median, 2.0), [0.0, -1.0, *NO_NUMBER]),
     "factor": (lambda factor: lx.LogNormal(1.0, factor), [0.5, 1.0, *NO_NUMBER]),

@@ -80,9 +80,9 @@ def test_what_the_data_do_not_determine_is_named():
 
 
 def test_bounds_hold():
-    found = lx.fit(
-        lambda p: jnp.stack([p["x"] - 5.0, p["y"] + 1.0]), {"x": lx.Bounded(0.5, 0, 2), "y": lx.Positive(1.0)}
-    )
+    residual = lambda p: jnp.stack([p["x"] - 5.0, p["y"] + 1.0])
+    with pytest.warns(UserWarning, match=r"'x' \(the upper one\), 'y' \(the lower one\)"):
+        found = lx.fit(residual, {"x": lx.Bounded(0.5, 0, 2), "y": lx.Positive(1.0)})
     assert 1.9 < found.params["x"] < 2.0
     assert 0.0 < found.params["y"] < 0.1
 

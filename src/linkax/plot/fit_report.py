@@ -13,7 +13,7 @@ from jaxtyping import Float
 from linkax.files import writable_folder, written_whole
 from linkax.plot.figure import Figure
 from linkax.scenery.colours import BLUE, FAINT, INK, VERMILION, body_colour
-from linkax.studies.fits.fit_result import EXACT, Fit, is_exact
+from linkax.studies.fits.fit_result import EXACT, Fit, doubts, is_exact, remark_on
 from linkax.studies.laboratory.experiments import Experiment
 from linkax.studies.laboratory.losses import Loss, influence
 from linkax.studies.laboratory.whiteness import Whiteness
@@ -57,7 +57,8 @@ def report(fit: Fit, path: Path, held_out: Sequence[Experiment]) -> Path:
     """
     writable_folder(path.parent, f"give another path than {str(path)!r}")
     title = f"Fit: {fit.ended} after {count(fit.steps, 'step')}"
-    parts = [f"<h1>{escape(title)}</h1>", _summary(fit), "<h2>Parameters</h2>", _parameters(fit), _doubts(fit)]
+    parts = [f"<h1>{escape(title)}</h1>", _summary(fit), "<h2>Parameters</h2>", _parameters(fit), _determined(fit)]
+    parts += [f"<p class=doubt>{escape(doubt)}.</p>" for doubt in doubts(fit)]
     if fit.covariance is not None:
         parts += ["<h2>Covariance and correlation</h2>", _correlation(fit)]
     parts += ["<h2>Loss</h2>", _picture(_loss(fit))]
@@ -109,17 +110,20 @@ def _parameters(fit) -> str:
     rows = []
     for name, value, error, low, high in zip(fit.names, values, errors, lower, upper, strict=True):
         if name in fit.undetermined:
-            rows.append((name, numbers(value), "", "", "", "", "!not determined by the data"))
+            rows.append((name, numbers(value), "", "", "", "", "!" + remark_on(fit, name)))
+            continue
+        if name in fit.on_bound:
+            rows.append((name, numbers(value), "", "", numbers(low), numbers(high), "!" + remark_on(fit, name)))
             continue
         share = f"{100.0 * error / abs(value):.2g} %" if value else ""
         rows.append((name, numbers(value), numbers(error), share, numbers(low), numbers(high), ""))
     return _table(("parameter", "value", "standard error", "of value", "95 % from", "to", ""), rows)
 
 
-def _doubts(fit) -> str:
+def _determined(fit) -> str:
     if not fit.undetermined:
         told = (
-            "The data determine all parameters."
+            "The data determine all parameters" + (", but for those on a bound." if fit.on_bound else ".")
             if fit.covariance is not None
             else "No covariance: see how the fit ended."
         )
@@ -132,7 +136,8 @@ def _doubts(fit) -> str:
 
 
 def _correlation(fit) -> str:
-    known = [index for index, name in enumerate(fit.names) if name not in fit.undetermined]
+    unknown = {*fit.undetermined, *fit.on_bound}
+    known = [index for index, name in enumerate(fit.names) if name not in unknown]
     if len(known) < 2:
         return "<p>Fewer than two parameters are determined.</p>"
     names, covariance = [fit.names[index] for index in known], np.asarray(fit.covariance)[np.ix_(known, known)]

@@ -16,7 +16,7 @@ from linkax.studies.fits.design_result import Design
 from linkax.studies.fits.fit import check_output
 from linkax.studies.laboratory.experiments import Experiment, Experiments, checked_experiments
 from linkax.studies.parameters.free_parameters import FreeParameters, has_prior
-from linkax.studies.parameters.parameters import AbstractParameter, Bounded, Positive
+from linkax.studies.parameters.parameters import Bounded, Positive
 from linkax.studies.parameters.uncertainty import Scatter, uncertainty
 from linkax.xla.arrays import Array
 from linkax.xla.users_line import warn
@@ -33,21 +33,6 @@ NO_OPTIMUM = {
     "kink or the run is inaccurate; try a tighter accuracy, or another start",
     "limits not met": "no design that was tried meets the limits; start nearer to one that does, or widen them",
 }
-
-
-class _Between(AbstractParameter):
-    """Numbers by their place between two bounds, from 0 to 1."""
-
-    value: Float[Array, "..."]
-    lower: Float[Array, ""]
-    upper: Float[Array, ""]
-
-    @property
-    def free(self) -> Float[Array, "..."]:
-        return (self.value - self.lower) / (self.upper - self.lower)
-
-    def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self.lower + (self.upper - self.lower) * free
 
 
 class _Planned(eqx.Module):
@@ -244,12 +229,11 @@ def design(
     whole_number(steps, "steps")
     positive = lambda x: x > 0.0
     tolerance = float(require(number(tolerance, (), "tolerance"), positive, "tolerance", "it must be positive"))
-    free = FreeParameters.of(_replaced(params, lambda leaf: leaf.value, Bounded, Positive))
+    free = FreeParameters.of(_without_bounds(params))
     if free.num_priors:
         told = "give its number, and add number / standard deviation to the predictions"
         raise ValueError(f"params hold a parameter with a prior, {', '.join(map(repr, free.names))}; {told}")
-    boxed = lambda leaf: _Between(leaf.value, leaf.lower, leaf.upper)
-    choices = FreeParameters.of(_replaced(design, boxed, Bounded))
+    choices = FreeParameters.of(design)
     if choices.num_priors:
         given = [name for name, leaf in zip(choices.leaf_names, choices.leaves, strict=True) if has_prior(leaf)]
         raise ValueError(
@@ -288,10 +272,10 @@ def design(
     return result
 
 
-def _replaced(tree, replace, *kinds):
-    """A pytree with other parameters, or numbers, in place of those of some kinds."""
-    is_leaf = lambda node: isinstance(node, AbstractParameter)
-    return jax.tree.map(lambda leaf: replace(leaf) if isinstance(leaf, kinds) else leaf, tree, is_leaf=is_leaf)
+def _without_bounds(params):
+    """Numbers in place of what bounds them."""
+    is_bounded = lambda node: isinstance(node, Bounded | Positive)
+    return jax.tree.map(lambda leaf: leaf.value if is_bounded(leaf) else leaf, params, is_leaf=is_bounded)
 
 
 def _chosen(of, free) -> tuple[int, ...]:
@@ -378,7 +362,7 @@ def _minimised(search, start, steps, progress) -> int:
             lambda x: float(search.at(x).log_size),
             start,
             jac=gradient,
-            bounds=_bounds(search.experiment.choices),
+            bounds=np.stack(search.experiment.choices.ends, axis=1),
             constraints=[conditions] * bool(search.last.excess.size),
             method="SLSQP",
             options={"maxiter": steps, "ftol": search.tolerance},
@@ -397,16 +381,10 @@ def _ending(search, status) -> str:
     return ENDED.get(status, "no better step")
 
 
-def _bounds(choices):
-    """Of each free number of the design."""
-    ends = [(0.0, 1.0) if isinstance(leaf, _Between) else (None, None) for leaf in choices.leaves]
-    return [end for end, scale in zip(ends, choices.scales, strict=True) for _ in range(scale.size)]
-
-
 def _active(choices, x, names, excess) -> list[str]:
     """Limits that are reached, and numbers of the design that are at a bound."""
     active = [name for name, value in zip(names, excess, strict=True) if value >= -REACHED]
-    for name, (lower, _), place in zip(choices.free_names, _bounds(choices), x, strict=True):
-        if lower is not None and min(place, 1.0 - place) <= REACHED:
-            active.append(f"{name}, {'lower' if place < 0.5 else 'upper'} bound")
+    for side, ends in zip(("lower", "upper"), choices.ends, strict=True):
+        at_end = np.abs(x - np.asarray(ends)) <= REACHED
+        active += [f"{name}, {side} bound" for name, there in zip(choices.free_names, at_end, strict=True) if there]
     return active

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Bool, Int
 
 from linkax.model.code import ByValue
 from linkax.model.numbers import number, require, require_type, whole_number
-from linkax.studies.fits.fit_result import Fit, Starts
+from linkax.studies.fits.fit_result import Fit, Starts, doubts
 from linkax.studies.fits.fit_search import (
     AbstractSearch,
     Descent,
@@ -26,9 +27,9 @@ from linkax.studies.fits.fit_search import (
 from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.laboratory.experiments import Experiment
 from linkax.studies.laboratory.laboratory import FITTED, Laboratory
-from linkax.studies.parameters.free_parameters import FreeParameters
+from linkax.studies.parameters.free_parameters import NEAREST, FreeParameters
 from linkax.studies.parameters.parameters import as_arrays
-from linkax.studies.parameters.uncertainty import DEPENDENT, uncertainty
+from linkax.studies.parameters.uncertainty import DEPENDENT, NO_INFLUENCE, uncertainty
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import compiling
 
@@ -39,6 +40,8 @@ else:
 
 DEFAULT_STEPS = {"residual": 100, "loss": 1000}
 DEFAULT_TOLERANCE = 1e-6
+SETTLED_ENDS = "converged", "stopped early"
+AT_END = 1e-4  # of the range between bounds, up to which a number is on one, of a loss
 SETTLED = 1e-2  # relative change of the noise of sensors, from which on it stays as it is found
 ROUNDS = 10  # of finding it
 DEFAULT_RATE = 0.02  # of Adam, in parameters that all start near one
@@ -99,8 +102,8 @@ def fit(
     **Raises:** `ValueError` for parameters that are not numbers; for a function that returns none, or that is not
     finite or has no derivative where the fit starts; and for a checkpoint of another fit.
 
-    **Warns:** of parameters that the data do not determine, where the fit ended at an edge or without derivative, and
-    of noise of sensors that does not settle.
+    **Warns:** of parameters that the data do not determine, or whose best value lies beyond a bound, where the fit
+    ended at an edge or without derivative, and of noise of sensors that does not settle.
     """
     kinds = Callable | Experiment | list | tuple
     require_type(
@@ -126,6 +129,7 @@ def fit(
         z, data, ended = _settled(again, search, laboratory, z, data, steps, losses, ended)
     if is_loss:
         result = _without_covariance(search, z, min(losses), None, losses, ended)
+        result = result._replace(on_bound=_named(search.free, _near_ends(search.free, z)))
     else:
         result = _fit_of_residual(search, z, data, losses, ended, tolerance, laboratory)
     _warn(result)
@@ -209,7 +213,7 @@ def _search_by(optimiser, function, free, mode, is_loss, tolerance) -> AbstractS
     if mode not in (None, "forward", "reverse"):
         raise ValueError(f"mode is {mode!r}; give 'forward', 'reverse', or None")
     if optimiser is None:
-        optimiser = optax.adam(DEFAULT_RATE) if is_loss else LevenbergMarquardt(tolerance, tolerance)
+        optimiser = optax.adam(DEFAULT_RATE) if is_loss else LevenbergMarquardt(tolerance, tolerance, free)
     by_squares = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
     if not by_squares:
         known_ones = "give one of optax, such as optax.adam(1e-2), or a least-squares solver of optimistix"
@@ -224,6 +228,7 @@ def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> F
     residual, slopes = (np.asarray(part) for part in sensitivity(search, z, args))
     if ended == "converged" and _is_at_edge(search, z, args, residual, slopes, tolerance):
         ended = "at an edge"
+    gradient, pulled = slopes.T @ residual, _beyond_bounds(search.free, z, residual, slopes)
     loss, count, scatter = float(0.5 * residual @ residual), len(residual) - search.free.num_priors, None
     there, factors = np.ones(len(residual), bool), np.ones(len(residual))
     if laboratory is not None:
@@ -237,13 +242,37 @@ def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> F
         result = result._replace(experiments=tuple(laboratory.experiments), noises=dict(args[0]))
     if ended in NO_MINIMUM:
         return result
-    estimate = uncertainty(residual, slopes, search.free, z, scatter)
+    pulls = np.where(pulled, -gradient, 0.0) if ended in SETTLED_ENDS else None
+    estimate = uncertainty(residual, slopes, search.free, z, scatter, pulls)
     return result._replace(
+        on_bound=_named(search.free, estimate.spread.sides),
         covariance=estimate.covariance,
         noise=estimate.noise,
         undetermined=estimate.undetermined,
         spread=estimate.spread,
     )
+
+
+def _beyond_bounds(free, z, residual, slopes) -> Bool[np.ndarray, " p"]:
+    """Which free numbers are on a bound: by the slope of the loss and its curvature, its minimum lies beyond."""
+    gradient, sizes = slopes.T @ residual, np.linalg.norm(slopes, axis=0)
+    lower, upper = map(np.asarray, free.ends)
+    way = np.where(gradient > 0.0, np.minimum(z - lower, free.longest), upper - z)
+    beyond = np.abs(gradient) / np.maximum(way, NEAREST) > sizes**2
+    # A logarithm that fell has lost its influence by that.
+    fell = np.isfinite(np.asarray(free.longest)) & (np.asarray(z) < np.asarray(free.start))
+    return beyond & (fell | (sizes > NO_INFLUENCE * np.max(sizes, initial=0.0)))
+
+
+def _near_ends(free, z) -> Int[np.ndarray, " p"]:
+    """Of each free number: -1 and 1 where it is at its lower and its upper end, else 0."""
+    lower, upper = (np.abs(np.asarray(z - end)) <= AT_END for end in free.ends)
+    return upper.astype(int) - lower.astype(int)
+
+
+def _named(free, sides) -> dict[str, str]:
+    """The names of those that are on a bound, as in `Fit.on_bound`."""
+    return {name: "lower" if side < 0 else "upper" for name, side in zip(free.free_names, sides, strict=True) if side}
 
 
 def _without_covariance(search, z, loss, residual, losses, ended) -> Fit:
@@ -255,6 +284,7 @@ def _without_covariance(search, z, loss, residual, losses, ended) -> Fit:
         covariance=None,
         noise=None,
         undetermined=[],
+        on_bound={},
         history={"loss": np.array(losses)},
         steps=len(losses) - 1,
         ended=ended,
@@ -263,9 +293,11 @@ def _without_covariance(search, z, loss, residual, losses, ended) -> Fit:
 
 
 def _warn(result: Fit):
-    """Warn where a fit ended in no minimum, or data do not determine all parameters."""
+    """Warn where a fit ended in no minimum, where there are doubts, or data do not determine all parameters."""
     if result.ended in NO_MINIMUM:
         warn(f"the fit ended {result.ended!r}: {NO_MINIMUM[result.ended]}")
+    for doubt in doubts(result):
+        warn(doubt)
     if result.undetermined:
         warn(
             f"the data do not determine {', '.join(map(repr, result.undetermined))}: a change of "
@@ -297,8 +329,10 @@ def check_output(shape: Any, what: str) -> None:
 
 
 def _is_at_edge(search, z, args, residual, slopes, tolerance) -> bool:
-    """Whether an undamped step that should lower the loss leads to where the function is not finite."""
-    step = -np.linalg.lstsq(slopes, residual, rcond=DEPENDENT)[0]
+    """Whether an undamped step within bounds that should lower the loss leads to where the function is not finite."""
+    slopes = np.where(_beyond_bounds(search.free, z, residual, slopes), 0.0, slopes)
+    low, high = map(np.asarray, search.free.room(z))
+    step = np.clip(-np.linalg.lstsq(slopes, residual, rcond=DEPENDENT)[0], low, high)
     left = residual + slopes @ step
     gains = residual @ residual - left @ left > max(tolerance, np.finfo(float).eps) * (residual @ residual)
     return bool(gains and not np.all(np.isfinite(sensitivity(search, z + step, args)[0])))

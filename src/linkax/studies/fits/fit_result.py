@@ -33,14 +33,29 @@ def _table(fit: "Fit") -> Table:
     values = np.concatenate([np.ravel(known(leaf)) for leaf in jax.tree.leaves(fit.params)])
     spreads = [None] * len(values) if fit.covariance is None else np.sqrt(np.diagonal(np.asarray(fit.covariance)))
     rows = [
-        (name, numbers(value), "" if spread is None else numbers(spread), *_undetermined(fit, name))
+        (name, numbers(value), "" if spread is None or np.isnan(spread) else numbers(spread), remark_on(fit, name))
         for name, value, spread in zip(fit.names, values, spreads, strict=True)
     ]
     return Table(title, [Rows(("parameter", "value", "standard error", ""), rows, "parameters")])
 
 
-def _undetermined(fit, name):
-    return ["not determined by the data" if name in fit.undetermined else ""]
+def remark_on(fit: "Fit", name: str) -> str:
+    """What there is to say of a number."""
+    if name in fit.on_bound:
+        return f"on its {fit.on_bound[name]} bound"
+    return "not determined by the data" if name in fit.undetermined else ""
+
+
+def doubts(fit: "Fit") -> list[str]:
+    """What there is to say of bounds."""
+    told = []
+    if fit.on_bound:
+        names = ", ".join(f"{name!r} (the {side} one)" for name, side in fit.on_bound.items())
+        told.append(
+            f"the best value lies on a bound, or beyond it, of {names}: it has no standard error, and others are as "
+            "sure as told only if the bound is right; widen it, or look whether model and data fit to each other"
+        )
+    return told
 
 
 class Starts(NamedTuple):
@@ -69,6 +84,10 @@ class Fit(NamedTuple):
       derivative. `noise`: standard deviation of the residual, None likewise; of experiments in units of the noise that
       sensors give, or that was found.
     - `undetermined`: names of the numbers that the data do not determine.
+    - `on_bound`: {name: "lower" or "upper"} of the numbers that lie on a bound, beyond which the loss would fall
+      further, or, of a loss, within 1e-4 of the range from it. They have no standard error: their covariance is NaN,
+      and that of other numbers is as if they were known. Of a `PhysicalInertia` it has the parameter's own name, where
+      a body has no mass or no extent along some axis.
     - `history`: {"loss": at each step, where noise is found in units of that found so far}. `steps`: number of steps.
     - `ended`: "converged", "stopped early", "diverged", or "out of steps"; "at an edge", where the loss would fall
       further but the function is not finite there; "no derivative", where the function is finite and its derivative is
@@ -86,6 +105,7 @@ class Fit(NamedTuple):
     covariance: np.ndarray | Any
     noise: float | None
     undetermined: list[str]
+    on_bound: dict[str, str]
     history: dict[str, np.ndarray]
     steps: int
     ended: str
@@ -108,7 +128,9 @@ class Fit(NamedTuple):
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Lower and upper ends of the confidence intervals of all numbers, each in the structure of `params`.
 
-        They follow from Student's t distribution, and stay within the bounds of `Positive` and `Bounded`.
+        They follow from Student's t distribution, and end at the bounds of `Positive` and `Bounded` at the latest. Of a
+        number that is on a bound, the interval reaches from there to where the likelihood has fallen as much, when the
+        residual is linear; `linkax.profile` tells without that.
 
         **Raises:** `ValueError` for a fit without covariance, and for a level that is not between 0 and 1.
         """
@@ -121,7 +143,8 @@ class Fit(NamedTuple):
         """Draw parameters from Laplace's approximation of their posterior, for predictions with their uncertainty.
 
         The free numbers are normal about the fit, with its covariance, as from their priors, which are flat but for
-        those of `Normal` and `LogNormal`; so draws stay within the bounds of `Positive` and `Bounded`.
+        those of `Normal` and `LogNormal`, and within the bounds of `Positive` and `Bounded`. Numbers that lie on a
+        bound stay there.
 
         **Arguments:** `key`: of `jax.random`. `count`: number of draws.
 
@@ -130,7 +153,7 @@ class Fit(NamedTuple):
         **Raises:** `ValueError` for a fit without covariance, and for one of parameters that the data do not determine.
         """
         spread = self.determined()
-        if not np.all(np.isfinite(spread.deviation)):
+        if not np.all(np.isfinite(spread.deviation[spread.sides == 0])):
             raise ValueError(
                 f"the data do not determine {', '.join(map(repr, self.undetermined))}, so no draws can be made; fix "
                 "some, or add what is known of them to the residual"

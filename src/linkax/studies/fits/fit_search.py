@@ -104,6 +104,8 @@ class Squares(AbstractSearch):
         given = (), {"jac": "bwd"}, state, frozenset()
         z, state, _ = self.solver.step(_residual(*found), z, *given)
         done, _ = self.solver.terminate(_residual(*found), z, *given[:2], state, frozenset())
+        low, high = self.free.room(z)
+        state = eqx.tree_at(lambda state: state.y_eval, state, z + jnp.clip(state.y_eval - z, low, high))
         smooth = jnp.all(jnp.isfinite(state.f_info.jac.as_matrix()))
         return z, state, 0.5 * jnp.sum(state.f_info.residual**2), smooth, done
 
@@ -136,9 +138,13 @@ class Descent(AbstractSearch):
 
         forward = len(z) <= FEW if self.mode is None else self.mode == "forward"
         value, slope = _linearised(loss, z) if forward else jax.value_and_grad(loss)(z)
+        low, high = self.free.room(z)
+        slope = jnp.where(jnp.where(slope > 0.0, low, high) == 0.0, 0.0, slope)
         solver = optax.with_extra_args_support(self.solver)
         update, state = solver.update(slope, state, z, value=value, grad=slope, value_fn=loss)
         moved: Any = optax.apply_updates(z, update)
+        low, high = self.free.room(z)
+        moved = z + jnp.clip(moved - z, low, high)
         return moved, state, value, jnp.all(jnp.isfinite(slope)), jnp.zeros((), bool)
 
 

@@ -18,6 +18,7 @@ from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.fits.profile_result import Profile
 from linkax.studies.laboratory.experiments import Experiment
 from linkax.studies.laboratory.laboratory import Laboratory
+from linkax.studies.parameters.free_parameters import NEAREST
 from linkax.studies.parameters.parameters import as_arrays
 from linkax.tables import one
 from linkax.xla.arrays import Array
@@ -63,7 +64,7 @@ def profile(
       `Fit`, whose noise of sensors stays.
     - `name`: of a number among `found.names`, such as "mass", or "springs[1]" of an array.
     - `values`: of that number, (n,), in any order. By default `count` ones that reach twice as far as the interval of
-      95 %, or, where the data determine none, as far as the parameter itself.
+      95 %, or, where the data determine none, as far as the parameter itself; and no further than its bounds.
     - `steps`, `tolerance`: of each refit, as in `linkax.fit`.
 
     **Returns:** a `Profile`. A refit that fails is marked, and harms no other.
@@ -97,7 +98,7 @@ def profile(
         places = _default_places(spread, entry, whole_number(count, "count", least=3))
     else:
         places = _places_of(spread.free, spread.z, index, entry, _checked(values), name)
-    given = LevenbergMarquardt(tolerance, tolerance), function, spread.free, None, False
+    given = LevenbergMarquardt(tolerance, tolerance, spread.free), function, spread.free, None, False
     with compiling():
         again, _ = sensitivity(Squares(*given), spread.z, data)
     _check_same(float(0.5 * again @ again), found.loss, len(found.residual))
@@ -116,6 +117,7 @@ def profile(
         loss=found.loss,
         noise=_unit(spread, entry),
         freedom=spread.freedom,
+        bounds=_reached(spread, index, entry, z[:, entry]),
     )
     _warn(result)
     return result
@@ -150,10 +152,28 @@ def _checked(values) -> Float[np.ndarray, " n"]:
 
 
 def _default_places(spread, entry, count):
-    """Of the free number: on both sides of the fit."""
-    width = WIDTH * spread.quantile(LEVEL) * spread.deviation[entry]
+    """Of the free number: on both sides of the fit, within its ends; from a bound to one side."""
+    width, side, here = WIDTH * spread.half_width(LEVEL)[entry], spread.sides[entry], float(spread.z[entry])
     width = width if np.isfinite(width) else UNKNOWN
-    return jnp.asarray(spread.z[entry] + width * np.linspace(-1.0, 1.0, count))
+    lower, upper = (float(end[entry]) for end in spread.free.ends)
+    first, last = max(here - width, min(here, lower + NEAREST)), min(here + width, max(here, upper - NEAREST))
+    if not side:
+        return jnp.linspace(first, last, count)
+    # Close to the bound the root rises as that of the distance. Of a logarithm, the width is in units of the number.
+    steps = np.linspace(0.0, 1.0, count) ** 2
+    if np.isfinite(spread.free.longest[entry]):
+        return here + jnp.log1p(width * steps)
+    return here + jnp.asarray(steps * (first - here if side > 0 else last - here))
+
+
+def _reached(spread, index, entry, places) -> tuple[float, float]:
+    """The bounds of a number that are reached, by the fit or by places of the free number."""
+    found = []
+    for sign, ends, bounds in zip((-1, 1), spread.free.ends, spread.free.bounds, strict=True):
+        reached = spread.sides[entry] == sign or np.any(np.abs(places - ends[entry]) <= 2.0 * NEAREST)
+        found.append(float(bounds[index]) if reached else sign * np.inf)
+    lower, upper = found
+    return lower, upper
 
 
 def _places_of(free, z, index, entry, values, name):

@@ -10,10 +10,11 @@ from linkax.tables import Rows, Table, count, numbers, one, printed_as
 
 def _table(found: "Profile") -> Table:
     title = f"Profile of {found.name}: {count(len(found.values), 'value')}, {one(found.best)} fits best"
-    told = lambda converged: "" if converged else "not refitted"
-    columns = zip(found.values, found.losses, found.roots, map(told, found.converged), strict=True)
-    rows = [(numbers(value), numbers(loss), numbers(root), mark) for value, loss, root, mark in columns]
-    ends = [(f"{level:.0%}", *map(one, found.interval(level))) for level in (0.68, 0.95)]
+    mark = lambda converged: "" if converged else "not refitted"
+    columns = zip(found.values, found.losses, found.roots, map(mark, found.converged), strict=True)
+    rows = [(numbers(value), numbers(loss), numbers(root), remark) for value, loss, root, remark in columns]
+    told = lambda end: one(end) + " (bound)" * (np.isfinite(end) and end in found.bounds)
+    ends = [(f"{level:.0%}", *map(told, found.interval(level))) for level in (0.68, 0.95)]
     intervals = Rows(("interval", "from", "to"), ends)
     return Table(title, [intervals, Rows((found.name, "loss", "signed root", ""), rows, "values")])
 
@@ -26,6 +27,7 @@ class Profile(NamedTuple):
     - `losses`: half the sum of squares of each refit, (n,). `loss`: that of the fit.
     - `params`: of each refit, in the structure of `Fit.params` with a leading axis.
     - `converged`: whether each refit did, (n,); others count for nothing.
+    - `bounds`: lower and upper bound of the number, where `values` reach it, else minus and plus infinity.
     - `noise`: of the residual, for this number: its standard error over what the curvature of the loss makes it for
       noise of one; without priors and robust losses, the standard deviation. `freedom`: its degrees of freedom.
     """
@@ -39,6 +41,7 @@ class Profile(NamedTuple):
     loss: float
     noise: float
     freedom: float
+    bounds: tuple[float, float] = (-np.inf, np.inf)
 
     @property
     def roots(self) -> Float[np.ndarray, " n"]:
@@ -49,8 +52,8 @@ class Profile(NamedTuple):
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Lower and upper end of the interval of the likelihood ratio.
 
-        Where the square of the root is the quantile of F(1, freedom), interpolated; infinite where the values do not
-        reach as far.
+        Where the square of the root is the quantile of F(1, freedom), interpolated. Where the values do not reach as
+        far, it is the bound, if they reach that, and else infinite.
 
         **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
@@ -72,7 +75,7 @@ class Profile(NamedTuple):
         distances, roots = distances[order], np.abs(self.roots[chosen][order])
         beyond = np.flatnonzero(roots >= abs(root))
         if not len(beyond):
-            return side * np.inf
+            return self.bounds[int(side > 0.0)]
         last = beyond[0] + 1
         curve = PchipInterpolator([0.0, *distances[:last]], np.maximum.accumulate([0.0, *roots[:last]]))
         return float(self.best + side * curve.solve(abs(root), extrapolate=False)[0])

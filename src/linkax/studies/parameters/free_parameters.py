@@ -14,11 +14,16 @@ from linkax.studies.parameters.parameters import AbstractParameter
 from linkax.studies.parameters.paths import path_parts
 from linkax.xla.arrays import Array
 
+NEAREST = 1e-9  # to an end of z, from where no step leads closer
+CLOSER = 0.99  # of the way to it, that one step may go
+
 
 class FreeParameters(eqx.Module):
-    """Parameters as functions of a vector z without bounds, (p,).
+    """Parameters as functions of a vector z, (p,).
 
-    Plain numbers are in units of their start, so that their entries of z start at ±1, or at 0.
+    Plain numbers are in units of their start, so that their entries of z start at ±1, or at 0. Entries of z are between
+    `ends`, and one step changes them by no more than `longest`, so that it does not lead to where a parameter, as a
+    function of them, is flat.
 
     - `leaves`: arrays, and `AbstractParameter`s. `structure`: the pytree that they are leaves of.
     - `scales`: units of the free numbers of each leaf.
@@ -84,9 +89,42 @@ class FreeParameters(eqx.Module):
                 eqx.tree_at(lambda leaf: leaf.value, leaf, part).free if isinstance(leaf, AbstractParameter) else part
                 for leaf, part in zip(self.leaves, parts, strict=True)
             ]
-            return ravel_pytree([part / scale for part, scale in zip(free, self.scales, strict=True)])[0]
+            return self._within(ravel_pytree([part / scale for part, scale in zip(free, self.scales, strict=True)])[0])
 
         return jax.vmap(z_of)(*parts)
+
+    def _within(self, z):
+        """z, NaN where it is not between the ends."""
+        lower, upper = self.ends
+        return jnp.where((z >= lower) & (z <= upper), z, jnp.nan)
+
+    def _of_entries(self, of_leaf) -> Float[Array, " p"]:
+        """A number for each entry of z."""
+        each = [of_leaf(leaf) if _is_parameter(leaf) else jnp.inf for leaf in self.leaves]
+        parts = [jnp.broadcast_to(jnp.asarray(x, float), s.shape) for x, s in zip(each, self.scales, strict=True)]
+        return ravel_pytree(parts)[0]
+
+    @property
+    def ends(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Of each entry of z, minus and plus infinity where it has none."""
+        return -self._of_entries(lambda leaf: -leaf.ends[0]), self._of_entries(lambda leaf: leaf.ends[1])
+
+    @property
+    def longest(self) -> Float[Array, " p"]:
+        """Largest change of each entry of z in one step."""
+        return self._of_entries(lambda leaf: leaf.longest)
+
+    def room(self, z: Float[Array, " p"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Least and largest change of each entry of z in one step: not to an end, and no longer than the longest."""
+        lower, upper = self.ends
+        way = lambda apart: jnp.minimum(CLOSER * jnp.where(apart > NEAREST, apart, 0.0), self.longest)
+        return -way(z - lower), way(upper - z)
+
+    @property
+    def bounds(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Lower and upper bounds of all numbers that are `apart`, infinite where there is none."""
+        lower, upper = self.ends
+        return np.asarray(self.vector(lower)), np.asarray(self.vector(upper))
 
     def _parts(self, z) -> list[Any]:
         """z in the structure of the free numbers of the leaves."""
@@ -119,7 +157,7 @@ class FreeParameters(eqx.Module):
             eqx.tree_at(lambda leaf: leaf.value, leaf, value) if isinstance(leaf, AbstractParameter) else value
             for leaf, value in zip(self.leaves, values, strict=True)
         ]
-        return eqx.tree_at(lambda free: free.leaves, self, leaves).start
+        return self._within(eqx.tree_at(lambda free: free.leaves, self, leaves).start)
 
     def vector(self, z: Float[Array, " p"]) -> Float[Array, " n"]:
         """All numbers of `params(z)`."""

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import ArrayLike, Float
 
@@ -14,12 +15,16 @@ from linkax.model.bodies import inertia_tensor
 from linkax.model.numbers import is_finite, namespace, number, real, require
 from linkax.xla.arrays import Array
 
+OF_LOGARITHM = 2.0  # the longest step of a logarithm: a linear model of its exponential tells little of longer ones
+
 
 class AbstractParameter(eqx.Module):
     """A parameter as a function of free numbers, which may take any value. `value`: where the fit starts."""
 
     # Whether the free numbers are known beforehand to be normal, with mean 0 and standard deviation 1.
     has_prior: ClassVar[bool] = False
+    # Between which the free numbers are.
+    ends: ClassVar[tuple[float, float]] = (-np.inf, np.inf)
 
     value: eqx.AbstractVar[Any]
 
@@ -31,6 +36,11 @@ class AbstractParameter(eqx.Module):
     @abc.abstractmethod
     def value_of(self, free: Float[Array, "..."]) -> Any:
         """The parameter as a function of the free numbers."""
+
+    @property
+    def longest(self) -> Any:
+        """How far one step may change each free number; finite of those whose exponential the parameter is."""
+        return np.inf
 
 
 class Positive(AbstractParameter):
@@ -53,14 +63,22 @@ class Positive(AbstractParameter):
     def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.exp(free)
 
+    @property
+    def longest(self) -> Any:
+        return OF_LOGARITHM
+
 
 class Bounded(AbstractParameter):
-    """Numbers that stay between two bounds, fitted by the logit of their place between them.
+    """Numbers that stay between two bounds, fitted by their place between them, from 0 to 1.
+
+    Steps of a fit end before a bound; one that starts on a bound may stay there.
 
     **Arguments:** `value`: where the fit starts, of any shape. `lower`, `upper`: the bounds, one number each.
 
-    **Raises:** `ValueError` for numbers that are not between the bounds.
+    **Raises:** `ValueError` for numbers that are beyond the bounds, and for bounds that are not in rising order.
     """
+
+    ends = (0.0, 1.0)
 
     value: Float[Array, "..."]
     lower: Float[Array, ""]
@@ -68,15 +86,17 @@ class Bounded(AbstractParameter):
 
     def __init__(self, value: ArrayLike | Sequence, lower: ArrayLike, upper: ArrayLike) -> None:
         self.lower, self.upper = (number(bound, (), "Bounded: bound") for bound in (lower, upper))
-        inside = lambda value: (value > self.lower) & (value < self.upper)
-        self.value = _checked("Bounded", value, inside, f"must lie between {lower} and {upper}")
+        inside = lambda value: (self.lower < self.upper) & (value >= self.lower) & (value <= self.upper)
+        self.value = _checked("Bounded", value, inside, f"must lie between {lower} and {upper}, in rising order")
 
     @property
     def free(self) -> Float[Array, "..."]:
-        return jax.scipy.special.logit((self.value - self.lower) / (self.upper - self.lower))
+        return (self.value - self.lower) / (self.upper - self.lower)
 
     def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
-        return jnp.asarray(self.lower + (self.upper - self.lower) * jax.nn.sigmoid(free))
+        # Line searches and intervals ask beyond the ends. By selection, which has a derivative at the ends.
+        place = jnp.where(free < 0.0, 0.0, jnp.where(free > 1.0, 1.0, free))
+        return (1.0 - place) * self.lower + place * self.upper
 
 
 class Normal(AbstractParameter):
@@ -148,6 +168,10 @@ class LogNormal(AbstractParameter):
     def value_of(self, free: Float[Array, "..."]) -> Float[Array, "..."]:
         return self.median * self.factor**free
 
+    @property
+    def longest(self) -> Any:
+        return OF_LOGARITHM / jnp.log(self.factor)
+
 
 class Inertia(NamedTuple):
     """Inertia of a rigid body, as `linkax.RigidBody` takes it.
@@ -211,6 +235,11 @@ class PhysicalInertia(AbstractParameter):
         center = first / mass
         second = pseudo[:3, :3] - mass * jnp.outer(center, center)
         return Inertia(mass, center, jnp.trace(second) * jnp.eye(3) - second)
+
+    @property
+    def longest(self) -> Any:
+        # The inertia is quadratic in U, and the first four numbers are logarithms.
+        return jnp.array(4 * [OF_LOGARITHM / 2.0] + 6 * [jnp.inf])
 
 
 def _pseudo_inertia(mass, center, inertia):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.studies.parameters.free_parameters import FreeParameters
@@ -15,6 +15,8 @@ from linkax.xla.arrays import Array
 NO_INFLUENCE = 1e-10  # sensitivity of a parameter, relative to the largest, up to which it has no influence
 DEPENDENT = 1e-8  # diagonal entry of R, relative to the largest, up to which it is rounding of the derivatives
 INVOLVED = 1e-3  # part of a parameter in a change that the data do not see, up to which it is not involved
+
+MOST_TRIALS = 1000  # of draws within bounds
 
 
 class Spread(NamedTuple):
@@ -25,6 +27,9 @@ class Spread(NamedTuple):
       them. `deviation`: their standard deviations, (p,), infinite there. `unscaled`: what `of_free` were if all rows of
       the residual had variance one.
     - `noise`: standard deviation of the residual. `freedom`: its degrees of freedom.
+    - `sides`: -1 or 1 for a free number on its lower or upper bound, else 0, (p,). `of_free` is zero for one on a
+      bound; its `deviation` is what it would be without, when others stay on theirs, and `beyond` how far beyond the
+      bound its best value would then be, (p,).
     """
 
     free: FreeParameters
@@ -35,6 +40,8 @@ class Spread(NamedTuple):
     unscaled: Float[np.ndarray, "p p"]
     noise: float
     freedom: float
+    sides: Int[np.ndarray, " p"]
+    beyond: Float[np.ndarray, " p"]
 
     def quantile(self, level: float) -> float:
         """How many standard deviations an interval reaches to each side, by Student's t distribution."""
@@ -42,23 +49,46 @@ class Spread(NamedTuple):
 
         return float(student.ppf(0.5 + level / 2.0, self.freedom))
 
+    def half_width(self, level: float) -> Float[np.ndarray, " p"]:
+        """How far an interval of the likelihood reaches to each side, in free numbers; from a bound, to the inner."""
+        return np.sqrt((self.quantile(level) * self.deviation) ** 2 + self.beyond**2) - self.beyond
+
     def __call__(self, level: float) -> tuple[Any, Any]:
-        _, unravel = ravel_pytree(self.free.params(self.z))
-        times, ends = self.quantile(level), []
-        for sign in (-1.0, 1.0):
-            linear = np.asarray(self.free.vector(self.z)) + sign * times * np.sqrt(np.diagonal(self.covariance))
-            moved = np.asarray(self.free.vector(self.z + sign * times * self.deviation))
-            ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(np.where(self.free.apart, moved, linear)))))
+        best, unravel = np.asarray(self.free.vector(self.z)), ravel_pytree(self.free.params(self.z))[1]
+        times, half, bounds = self.quantile(level), self.half_width(level), self.free.bounds
+        rates = np.asarray(jax.jacfwd(self.free.vector)(self.z))
+        ends = []
+        for sign, bound in zip((-1.0, 1.0), bounds, strict=True):
+            linear = best + sign * times * np.sqrt(np.diagonal(self.covariance))
+            moved = np.asarray(self.free.vector(self.z + sign * half))
+            # From a bound the number itself is taken as linear: a logarithm would lead nowhere.
+            inner = np.clip(best + sign * rates @ np.where(self.sides == 0, 0.0, half), *bounds)
+            side = np.sum(np.where(rates != 0.0, self.sides, 0), axis=1)
+            from_bound = np.where(side == sign, bound, inner)
+            end = np.where(self.free.apart, np.where(side == 0, moved, from_bound), linear)
+            ends.append(jax.tree.map(np.asarray, unravel(jnp.asarray(end))))
         return tuple(ends)
 
     def draws(self, key: Array, count: int) -> Any:
-        """Parameters from the normal distribution of the free numbers, with a leading axis of `count`."""
-        size = np.where(self.deviation > 0.0, self.deviation, 1.0)  # zero where the fit is exact
+        """Parameters from the normal distribution of the free numbers within their ends, `count` along the first axis.
+
+        **Raises:** `ValueError` where hardly any are within the ends.
+        """
+        deviation = np.sqrt(np.diagonal(self.of_free))
+        size = np.where(deviation > 0.0, deviation, 1.0)  # zero where the fit is exact, and on a bound
         scaled = self.of_free / np.outer(size, size)
         values, vectors = np.linalg.eigh(scaled)
-        root = self.deviation[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-        normal = jax.random.normal(key, (count, len(self.z)))
-        return jax.tree.map(np.asarray, jax.vmap(self.free.params)(self.z + normal @ root.T))
+        root = deviation[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        (lower, upper), kept = map(np.asarray, self.free.ends), []
+        for trial in range(MOST_TRIALS):
+            normal = jax.random.normal(jax.random.fold_in(key, trial), (count, len(self.z)))
+            drawn = np.asarray(self.z) + np.asarray(normal) @ root.T
+            kept = [*kept, *drawn[np.all((drawn >= lower) & (drawn <= upper), axis=1)]][:count]
+            if len(kept) == count:
+                return jax.tree.map(np.asarray, jax.vmap(self.free.params)(jnp.asarray(kept)))
+        raise ValueError(
+            f"of {MOST_TRIALS * count} draws {len(kept)} are within the bounds; measure more, or sample the posterior"
+        )
 
 
 class Uncertainty(NamedTuple):
@@ -98,6 +128,8 @@ class _Triangle(NamedTuple):
 
     @staticmethod
     def of(slopes: Float[np.ndarray, "n p"]) -> "_Triangle":
+        if not slopes.size:
+            return _Triangle(np.zeros((0, 0)), np.zeros(0, int), 0, np.zeros(0))
         norms = np.linalg.norm(slopes, axis=0)
         matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
         scale = np.where(matters, norms, 1.0)
@@ -129,16 +161,21 @@ def uncertainty(
     free: FreeParameters,
     z: Float[Array, " p"],
     scatter: Scatter | None = None,
+    pulls: Float[np.ndarray, " p"] | None = None,
 ) -> Uncertainty:
     """Estimate the covariance of the parameters at z, by column-pivoted QR of the residual's sensitivities `slopes`.
 
     The last rows are those of priors, which have variance one.
 
-    **Arguments:** `scatter`: of the other rows; by default all have one noise, which is estimated.
+    **Arguments:** `scatter`: of the other rows; by default all have one noise, which is estimated. `pulls`: minus the
+    gradient of the loss by free numbers that are on a bound, else zero; these are taken as known for the others.
     """
     count, size = len(slopes) - free.num_priors, slopes.shape[1]
-    r, order, rank, scale = triangle = _Triangle.of(slopes)
-    to_free, inverse, rows = np.zeros((size, size)), triangle.inverse, order[:rank]
+    sides = np.zeros(size, int) if pulls is None else np.sign(pulls).astype(int)
+    inside, scale = np.flatnonzero(sides == 0), np.ones(size)
+    r, order, rank, scale[inside] = triangle = _Triangle.of(slopes[:, inside])
+    order, to_free, inverse = inside[order], np.zeros((size, size)), triangle.inverse
+    rows = order[:rank]
     to_free[np.ix_(rows, rows)] = inverse @ inverse.T / np.outer(scale[rows], scale[rows])
     gain = to_free @ slopes.T
     # What is left of the measurements when they have determined what priors leave to them.
@@ -149,9 +186,9 @@ def uncertainty(
     variances = np.concatenate([scatter.variances, np.ones(len(slopes) - count)])
     of_free = gain * variances @ gain.T
     # Changes that the residual does not see: of one dependent parameter, and of those that make up for it.
-    unseen = np.zeros((size, size - rank))
+    unseen = np.zeros((size, len(order) - rank))
     unseen[order[:rank]] = -inverse @ r[:rank, rank:]
-    unseen[order[rank:]] = np.eye(size - rank)
+    unseen[order[rank:]] = np.eye(len(order) - rank)
     lost = np.any(np.abs(unseen) > INVOLVED, axis=1)
     slopes_of_params = np.asarray(jax.jacfwd(free.vector)(z))
     covariance = slopes_of_params @ of_free @ slopes_of_params.T
@@ -162,7 +199,14 @@ def uncertainty(
     together = np.abs(depends @ (unseen / scale[:, None]))
     undetermined = np.any((each > 0.0) & (together > INVOLVED * each), axis=1)
     covariance[undetermined, undetermined] = np.inf
-    deviation = np.sqrt(np.where(lost, np.inf, np.diagonal(of_free)))
+    deviation, beyond = np.sqrt(np.where(lost, np.inf, np.diagonal(of_free))), np.zeros(size)
+    for entry in np.flatnonzero(sides):
+        own, others = slopes[:, entry], slopes[:, rows] / scale[rows]
+        own = own - others @ np.linalg.lstsq(others, own, rcond=DEPENDENT)[0]
+        curvature = max(own @ own, np.finfo(float).tiny)
+        deviation[entry], beyond[entry] = scatter.noise / np.sqrt(curvature), abs(pulls[entry]) / curvature
+    on_bound = free.apart & np.any((slopes_of_params != 0.0) & (sides != 0), axis=1)
+    covariance[on_bound], covariance[:, on_bound] = np.nan, np.nan
     names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
-    spread = Spread(free, z, covariance, of_free, deviation, to_free, scatter.noise, freedom)
+    spread = Spread(free, z, covariance, of_free, deviation, to_free, scatter.noise, freedom, sides, beyond)
     return Uncertainty(covariance, scatter.noise, names, spread)
