@@ -171,9 +171,11 @@ def test_fits_and_sweeps():
     params, names = {"mass": np.array(2.0), "rod": np.array(1.5)}, ["mass", "rod"]
     common = {"params": params, "loss": 0.1, "residual": None, "names": names, "history": {}, "steps": 3}
     covariance = np.diag([np.inf, 0.04])
-    ended = {"ended": "converged", "spread": None}
+    channels = {"encoder": lx.Explained(noise=0.1, left=0.1, measured=1.0, is_white=True)}
+    ended = {"ended": "converged", "spread": None, "channels": channels}
     fit = lx.Fit(**common, **ended, covariance=covariance, noise=0.5, undetermined=["mass"], on_bound={})
-    title, _, mass, rod = repr(fit).splitlines()
+    title, _, mass, rod, _, encoder = repr(fit).splitlines()
+    assert encoder.split() == ["encoder", "0.1", "0.1", "1", "99.0%"]
     assert "converged after 3 steps" in title
     assert "not determined" in mass
     assert rod.split() == ["rod", "1.5", "0.2"]

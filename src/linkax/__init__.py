@@ -172,6 +172,7 @@ from linkax.studies.fits.profile_result import Profile as Profile  # noqa: E402
 from linkax.studies.fits.shooting import Shots as Shots  # noqa: E402
 from linkax.studies.fits.shooting import shoot as shoot  # noqa: E402
 from linkax.studies.laboratory.experiments import Experiment as Experiment  # noqa: E402
+from linkax.studies.laboratory.laboratory import Explained as Explained  # noqa: E402
 from linkax.studies.laboratory.records import Channel as Channel  # noqa: E402
 from linkax.studies.laboratory.records import Record as Record  # noqa: E402
 from linkax.studies.laboratory.records import read_record as read_record  # noqa: E402

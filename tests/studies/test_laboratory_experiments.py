@@ -81,6 +81,30 @@ def test_noise_that_is_known_but_for_a_factor_gives_the_same(known):
     np.testing.assert_allclose(given.noise, found.noises["encoder"] / 0.02, rtol=1e-4)
 
 
+@pytest.mark.parametrize("wrong", [np.degrees, np.negative, lambda angle: angle + 1.0, lambda angle: 0.0 * angle])
+def test_a_channel_that_is_not_explained_is_told(known, motion, wrong):
+    """Degrees for radians, another sign, an offset, nothing; not one that is explained, or has noise alone."""
+    draw, noisy = np.random.default_rng(0), lambda values: values + NOISE * draw.normal(size=np.shape(values))
+    tip = np.asarray(motion.at(TIMES).position("arm", at="tip"))
+    angle = np.asarray(motion.at(TIMES).joint("hinge"))
+    record = {"encoder": (TIMES, noisy(wrong(angle))), "camera": (TIMES, noisy(tip))}  # whose third number is zero
+    sensors = lambda params: {
+        "encoder": lx.Encoder("hinge", gain=params["gain"]),
+        "camera": lx.Tracker("arm", "tip"),
+    }
+    with pytest.warns(UserWarning, match="does not explain channel 'encoder'") as told:
+        found = lx.fit(lx.Experiment(known, record, sensors), {"gain": lx.Normal(1.0, 1e-3)})
+    assert [word in str(told[0].message) for word in ("'encoder'", "camera")] == [True, False]
+    assert len(told) == 1
+    left, measured = found.predict()[0]["encoder"] - record["encoder"][1], np.std(record["encoder"][1])
+    encoder = found.channels["encoder"]
+    np.testing.assert_allclose([encoder.left, encoder.measured], [np.sqrt(np.mean(left**2)), measured], rtol=1e-9)
+    np.testing.assert_allclose(encoder.share, 1.0 - np.mean(left**2) / measured**2, rtol=1e-9)
+    assert found.channels["camera[0]"].share > 0.99
+    assert abs(found.channels["camera[2]"].share) < 0.1
+    assert f"{encoder.measured:.6g}" in str(found)
+
+
 def two_encoders(params):
     own = {"gain": params["gain"], "bias": params["own bias"]}
     return {"few": lx.Encoder("hinge", **own), "many": lx.Encoder("hinge", bias=params["bias"])}

@@ -103,7 +103,8 @@ def fit(
     finite or has no derivative where the fit starts; and for a checkpoint of another fit.
 
     **Warns:** of parameters that the data do not determine, or whose best value lies beyond a bound, where the fit
-    ended at an edge or without derivative, and of noise of sensors that does not settle.
+    ended at an edge or without derivative, of noise of sensors that does not settle, and of channels that the model
+    does not explain.
     """
     kinds = Callable | Experiment | list | tuple
     require_type(
@@ -239,7 +240,11 @@ def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> F
     residual, slopes = residual[there], (factors[:, None] * slopes)[there]
     result = _without_covariance(search, z, loss, residual[:count], losses, ended)
     if laboratory is not None:
-        result = result._replace(experiments=tuple(laboratory.experiments), noises=dict(args[0]))
+        result = result._replace(
+            experiments=tuple(laboratory.experiments),
+            noises=dict(args[0]),
+            channels=laboratory.explained(errors, args[0]),
+        )
     if ended in NO_MINIMUM:
         return result
     pulls = np.where(pulled, -gradient, 0.0) if ended in SETTLED_ENDS else None
@@ -289,6 +294,7 @@ def _without_covariance(search, z, loss, residual, losses, ended) -> Fit:
         steps=len(losses) - 1,
         ended=ended,
         spread=None,
+        channels={},
     )
 
 

@@ -12,9 +12,9 @@ from jax.flatten_util import ravel_pytree
 
 from linkax.model.numbers import require_type, whole_number
 from linkax.studies.laboratory.experiments import Experiment
-from linkax.studies.laboratory.laboratory import FITTED, Laboratory
+from linkax.studies.laboratory.laboratory import FITTED, Explained, Laboratory
 from linkax.studies.parameters.uncertainty import Spread
-from linkax.tables import Rows, Table, count, known, numbers, printed_as
+from linkax.tables import Rows, Table, count, known, numbers, one, printed_as
 from linkax.xla.arrays import Array
 
 ROUNDING = 1e-9  # standard error of a number relative to its start, up to which no measurement can be meant
@@ -36,7 +36,13 @@ def _table(fit: "Fit") -> Table:
         (name, numbers(value), "" if spread is None or np.isnan(spread) else numbers(spread), remark_on(fit, name))
         for name, value, spread in zip(fit.names, values, spreads, strict=True)
     ]
-    return Table(title, [Rows(("parameter", "value", "standard error", ""), rows, "parameters")])
+    head = "channel", "noise", "left", "measured", "explained"
+    channels = [
+        (name, one(of.noise), one(of.left), one(of.measured), "" if np.isnan(of.share) else f"{max(of.share, 0.0):.1%}")
+        for name, of in fit.channels.items()
+    ]
+    parts = [Rows(("parameter", "value", "standard error", ""), rows, "parameters")]
+    return Table(title, parts + [Rows(head, channels, "channels")] * bool(channels))
 
 
 def remark_on(fit: "Fit", name: str) -> str:
@@ -47,8 +53,14 @@ def remark_on(fit: "Fit", name: str) -> str:
 
 
 def doubts(fit: "Fit") -> list[str]:
-    """What there is to say of bounds."""
-    told = []
+    """What there is to say of channels, and of bounds."""
+    told = [
+        f"the model does not explain channel {name!r}: it leaves a standard deviation of {one(channel.left)}, and what "
+        f"was measured has {one(channel.measured)}; look whether units, signs and axes of the record are those of the "
+        "model"
+        for name, channel in fit.channels.items()
+        if channel.is_nothing
+    ]
     if fit.on_bound:
         names = ", ".join(f"{name!r} (the {side} one)" for name, side in fit.on_bound.items())
         told.append(
@@ -95,6 +107,9 @@ class Fit(NamedTuple):
     - `spread`: level of confidence -> ends of the intervals; None where `covariance` is.
     - `experiments`: those that were fitted, none for a function. `noises`: {channel: standard deviation} of what their
       sensors tell, where these do not give it.
+    - `channels`: {channel: `Explained`} of the experiments, of those of ten samples or more: `noise` beside the
+      standard deviations of what the model leaves, and of what was measured, and the `share` of variance that is
+      explained. Of several components, "name[0]", "name[1]", ….
     - `starts`: `Starts`, where there were several.
     """
 
@@ -110,6 +125,7 @@ class Fit(NamedTuple):
     steps: int
     ended: str
     spread: Spread | None
+    channels: dict[str, Explained]
     experiments: tuple[Experiment, ...] = ()
     noises: dict[str, np.ndarray] | None = None
     starts: Starts | None = None

@@ -18,9 +18,14 @@ from linkax.studies.laboratory.experiments import (
 )
 from linkax.studies.laboratory.losses import Loss, as_square, influence, spread
 from linkax.studies.laboratory.sensors import AbstractSensor
+from linkax.studies.laboratory.whiteness import Whiteness
 from linkax.studies.parameters.uncertainty import Scatter, leverages
 from linkax.xla.users_line import warn
 
+FEWEST = 10  # samples of a channel that tell how much is explained
+HARDLY = 0.1  # part of the variance up to which hardly any is explained
+WORSE = -0.5  # the same, from which on no noise explains that the mean would be better
+CORRELATED = 1e-3  # probability that noise is as correlated as what is left, below which it is none
 TELLING = 0.05  # mean curvature of a robust loss, above which it tells how sure a fit is
 FITTED = "with the fitted parameters"
 LEAST = 1e-9  # noise relative to the largest measurement, below which it is rounding
@@ -56,6 +61,31 @@ class Worth(NamedTuple):
 
     factors: Float[np.ndarray, " n"]
     scatter: Scatter
+
+
+class Explained(NamedTuple):
+    """How much a model explains of what was measured in one component of a channel, standard deviations all.
+
+    - `noise`: as the sensor gives it, or as found. `left`: of predicted less measured. `measured`: about its mean.
+    - `is_white`: whether what is left may be noise, without correlation from one sample to the next.
+
+    With a robust loss, outliers count less here, too.
+    """
+
+    noise: float
+    left: float
+    measured: float
+    is_white: bool
+
+    @property
+    def share(self) -> float:
+        """Part of the variance that is explained; below zero where the mean would explain more, NaN of a constant."""
+        return 1.0 - (self.left / self.measured) ** 2 if self.measured > 0.0 else float("nan")
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether hardly anything is explained of what is no noise alone."""
+        return self.share < WORSE or (self.share < HARDLY and not self.is_white)
 
 
 class Laboratory(NamedTuple):
@@ -196,6 +226,25 @@ class Laboratory(NamedTuple):
                 np.shape(each.record[name].values)[1:] for each in self.experiments if name in each.record.channels
             )
             found[name] = np.reshape(each, shape)
+        return found
+
+    def explained(self, errors: Errors, noise: Noise) -> dict[str, Explained]:
+        """How much predictions explain, by channel, "name[0]" and so on where it tells several numbers."""
+        values = self._rows(lambda i, name: np.asarray(self.experiments[i].record[name].values))
+        places = self._rows(lambda i, name: np.full(np.shape(self.experiments[i].record[name].values), i))
+        deviations, found = self._deviations(noise), {}
+        for group, (name, component) in enumerate(errors.names):
+            rows, loss = errors.of(group), self.by_channel[name].loss
+            if np.sum(rows) < FEWEST:
+                continue
+            left = spread(loss, errors.values[rows])
+            measured = values[rows] - (np.mean if loss == "squares" else np.median)(values[rows])
+            series = [errors.values[(errors.groups == group) & (places == i)] for i in np.unique(places[rows])]
+            whiteness = [Whiteness.of(influence(loss, each / left).first) for each in series if left > 0.0]
+            is_white = all(each is None or each.probability > CORRELATED for each in whiteness)
+            several = (name, 1) in errors.names
+            key = f"{name}[{component}]" if several else name
+            found[key] = Explained(float(deviations[rows][0]), left, spread(loss, measured), is_white)
         return found
 
     def first_noise(self, starts: Sequence[Any]) -> Noise:
