@@ -62,7 +62,7 @@ class _ScaledDescent(optx.AbstractDescent):
         matters = largest > NO_INFLUENCE * jnp.max(largest)
         sizes = jnp.where(matters, largest, 1.0)
         left, values, right = jnp.linalg.svd(jnp.where(matters, slopes / sizes, 0.0), full_matrices=False)
-        low, high = self.free.room(y)
+        low, high = map(jnp.asarray, self.free.room(y))
         found = values[:, None] * right, left.T @ f_info.residual, sizes, low * sizes, high * sizes
         return DescentState(*found, largest)
 

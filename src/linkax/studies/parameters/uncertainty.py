@@ -171,7 +171,8 @@ def uncertainty(
     gradient of the loss by free numbers that are on a bound, else zero; these are taken as known for the others.
     """
     count, size = len(slopes) - free.num_priors, slopes.shape[1]
-    sides = np.zeros(size, int) if pulls is None else np.sign(pulls).astype(int)
+    pulls = np.zeros(size) if pulls is None else pulls
+    sides = np.sign(pulls).astype(int)
     inside, scale = np.flatnonzero(sides == 0), np.ones(size)
     r, order, rank, scale[inside] = triangle = _Triangle.of(slopes[:, inside])
     order, to_free, inverse = inside[order], np.zeros((size, size)), triangle.inverse
