@@ -28,7 +28,7 @@ def servo(numbers, saveat):
         name="servo",
     )
     mechanism = lx.Mechanism([weight], [lx.Prismatic("slide", lx.GROUND, weight, "x")], [actuator])
-    return lx.simulate(mechanism, lx.State.as_drawn(mechanism), t1=T1, accuracy=lx.Accuracy(rtol=1e-6), saveat=saveat)
+    return lx.simulate(mechanism, lx.State.as_drawn(mechanism), t1=T1, accuracy=lx.Accuracy(rtol=3e-7), saveat=saveat)
 
 
 def servo_exact(numbers, ts):

@@ -27,6 +27,7 @@ ARGS = SimpleNamespace(
     internal=lambda y: None,
     scales=(SCALES, SCALES),
     can_go_on=lambda y: True,
+    times=None,
 )
 Y = jnp.array([1.0, 2e3, 3.0, 4e3, 0.0])
 FAR = StepError((jnp.zeros(2), jnp.zeros(2)), jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(0.5))
@@ -39,14 +40,14 @@ CONTROLLERS = [
 def adapt(controller, error, t0=0.0, t1=1.0, retries=0):
     control = MechanismControl(controller)
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
-    _, (inner, _) = control.init(None, t0, 10.0 * t1, Y, jnp.asarray(0.1), ARGS, None, 8.0)
-    state = inner, jnp.asarray(retries)
+    _, state = control.init(None, t0, 10.0 * t1, Y, jnp.asarray(0.1), ARGS, None, 8.0)
+    state = state._replace(retries=jnp.asarray(retries))
     return control.adapt_step_size(t0, t1, Y, Y, ARGS, error, 8.0, state)
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_a_stage_close_to_a_singular_configuration_is_moved_away(controller):
-    keep, next_t0, next_t1, _, (_, retries), _ = adapt(controller, FAR._replace(passes=jnp.asarray(1e-3)))
+    keep, next_t0, next_t1, _, (_, retries, _), _ = adapt(controller, FAR._replace(passes=jnp.asarray(1e-3)))
     assert not keep
     assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
 
@@ -56,7 +57,7 @@ def test_an_error_from_such_a_stage_does_not_choose_the_next_try(controller):
     """It is rounding, however short the step: steps cut by it would crawl into the singular configuration."""
     error = FAR._replace(error=(jnp.array([1e-4, 0.0]), jnp.zeros(2)))
     assert adapt(controller, error)[2] < 0.5
-    keep, next_t0, next_t1, _, (_, retries), _ = adapt(controller, error._replace(passes=jnp.asarray(1e-3)))
+    keep, next_t0, next_t1, _, (_, retries, _), _ = adapt(controller, error._replace(passes=jnp.asarray(1e-3)))
     assert not keep
     assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
 

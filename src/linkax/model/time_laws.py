@@ -44,8 +44,8 @@ class PiecewiseLinear(_Piecewise):
     """A function of time, linear between given values: a voltage, a valve's opening, a torque.
 
     Give it wherever a law is taken but to a `linkax.Drive`, whose motion must be smooth, and which takes a
-    `linkax.Spline`. Before the first time and after the last one it keeps its end values. It has kinks at its times: of
-    steps that end there, by `diffrax.ClipStepSizeController(..., jump_ts=times)`, there are fewer.
+    `linkax.Spline`. Before the first time and after the last one it keeps its end values. Steps of a run that adapt end
+    at its times, as at the `times` of any callable that has some.
 
     **Arguments:**
 
@@ -66,7 +66,7 @@ class Spline(_Piecewise):
     """A function of time by a cubic spline through given values, with a continuous second derivative: a drive's motion.
 
     Before the first time and after the last one it keeps its end values, which is smooth where `end_slopes` are zero,
-    as they are by default.
+    as they are by default. Steps of a run that adapt end at its times.
 
     **Arguments:**
 

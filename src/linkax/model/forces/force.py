@@ -117,8 +117,7 @@ class AbstractForce(AbstractElement):
     def switch(self, t: Time, motion: Motion, *args: Any) -> Scalar | None:
         """Compute a number that changes sign where the load has a kink or jumps; None for a smooth load.
 
-        Its magnitude should be about one, like that of a strain. The motion must go through zero there, and not be
-        pushed back from both sides.
+        In any unit. The motion must go through zero there, and not be pushed back from both sides.
         """
         return None
 

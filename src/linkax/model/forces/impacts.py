@@ -39,8 +39,8 @@ class Impact(AbstractForce):
     Where bounces follow each other ever faster, or a body comes to lie on the stop, infinitely many impacts would
     happen in finite time. The run ends there, once dg/dt after an impact is below `slowest` and the forces lead back to
     the stop, with the result `RESULTS.rests_on_stop`, as a run does that begins beyond the stop. Where motion is to go
-    on, take `linkax.JointLimit` or `linkax.Contact`. An impact that begins and ends within an eighth of a step is not
-    seen: a motion that only grazes the stop may need a smaller tolerance.
+    on, take `linkax.JointLimit` or `linkax.Contact`. Within a step the least value of the gap is sought, so that thin
+    obstacles are hit, as long as the gap between two eighths of a step falls no faster than beside them.
 
     **Arguments:**
 

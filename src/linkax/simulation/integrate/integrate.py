@@ -1,5 +1,6 @@
 """The compiled programs of a run: check its start, integrate, close what was saved."""
 
+import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float
 from linkax.equations.internal_states import bound
 from linkax.equations.system import system_of
 from linkax.formulations.formulation import AbstractFormulation
+from linkax.model.known_times import known_times
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.discrete_adjoint import Integrated, Integrator, integrate, solve_by_diffrax
@@ -98,7 +100,10 @@ def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     formulation, t0, t1, options, control = cast((run.formulation, run.t0, run.t1, run.options, run.control), dtype)
     in_order, t0, t1, dt0, saveat = _in_order(t0, t1, options.dt0, options.saveat)
     problem = problem_of(run.flat, formulation, run.accuracy, initial)
-    problem = eqx.tree_at(lambda p: p.can_start, problem, problem.can_start & in_order)
+    times = known_times(problem.mechanism) if control.is_adaptive else None
+    problem = dataclasses.replace(
+        problem, can_start=problem.can_start & in_order, times=None if times is None else times.astype(dtype)
+    )
     inputs = run.flat, initial.state, t0, t1, dt0, saveat
     if not saves_states(saveat):
         saveat = eqx.tree_at(lambda s: s.subs, saveat, _wrapped_saves(saveat.subs))

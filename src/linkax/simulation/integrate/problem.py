@@ -35,7 +35,8 @@ class Problem(eqx.Module):
 
     From a state that motion cannot start from, no step is taken (`can_start`). At `closed_at` [s] the state is on the
     loops already: there a correction would be rounding alone, which close to a singular configuration is amplified.
-    `from_singular`: the run starts in one. Vectors y: see `linkax.simulation.integrate.diffrax_contract`.
+    `from_singular`: the run starts in one. `times`: at which steps end, sorted [s]; None for none. Vectors y: see
+    `linkax.simulation.integrate.diffrax_contract`.
     """
 
     mechanism: Mechanism
@@ -45,6 +46,7 @@ class Problem(eqx.Module):
     can_start: Bool[Array, ""] | bool = True
     closed_at: Float[Array, ""] | float = np.inf
     from_singular: Bool[Array, ""] | bool = False
+    times: Float[Array, " n"] | None = None
 
     def packed(
         self,

@@ -1,6 +1,6 @@
 """A diffrax step size controller for motion on a manifold with singular configurations and switches."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -26,6 +26,18 @@ MOST_RETRIES = 4
 FEASIBLE = 0.1  # of a step's first distance: what any step can keep from a passage
 
 
+class ControlState(NamedTuple):
+    """The state of the controller inside, and of steps that must end at a time.
+
+    - `retries`: how often the step was tried again. `free`: how long the next one may be that need not end at a switch,
+      or at a known time of a law; zero where the controller inside knows that.
+    """
+
+    inner: Any
+    retries: Int[Array, ""]
+    free: Float[Array, ""]
+
+
 class MechanismControl(diffrax.AbstractStepSizeController):
     """Wrap any diffrax step size controller: it measures errors in the scales of the mechanism.
 
@@ -39,7 +51,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     An adaptive step with a stage close to a singular configuration is tried again, shorter, so that the configuration
     falls between two stages, whatever its error: that is rounding of this stage. Where a few tries do not help, or the
     step begins in the singular configuration, it is left as it is. A step that goes past a switch of a force element is
-    tried again up to there, see `linkax.simulation.integrate.switches`.
+    tried again up to there, see `linkax.simulation.integrate.switches`; the next one is as long as it was before.
 
     - `is_undifferentiated`: see `ProjectedSolver`.
     """
@@ -78,7 +90,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         args: Any,
         func: Any,
         error_order: Any,
-    ) -> tuple[Any, tuple[Any, Int[Array, ""]]]:
+    ) -> tuple[Any, ControlState]:
         (_, v), internal = args.unpacked(y0), args.internal(y0)
         if dt0 is None and self.is_adaptive:
             # Not diffrax's choice, which would compile the equations of motion twice more.
@@ -88,7 +100,8 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             dt0 = lax.stop_gradient(dt0)
         alike = (v, v) if internal is None else (v, v, internal)
         first, state = self.controller.init(terms, t0, t1, alike, dt0, args, func, error_order)
-        return first, (state, jnp.zeros((), int))
+        first, free = self._until_known(args, t0, first, jnp.zeros_like(t0))
+        return first, ControlState(state, jnp.zeros((), int), free)
 
     def adapt_step_size(
         self,
@@ -99,13 +112,13 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         args: Any,
         y_error: StepError,
         error_order: Any,
-        controller_state: tuple[Any, Int[Array, ""]],
-    ) -> tuple[Bool[Array, ""], Float[Array, ""], Any, Any, tuple[Any, Int[Array, ""]], diffrax.RESULTS]:
+        controller_state: ControlState,
+    ) -> tuple[Bool[Array, ""], Float[Array, ""], Any, Any, ControlState, diffrax.RESULTS]:
         """Accept or reject the step, and choose the next one; `y_error` is a `StepError`."""
         magnitude, candidate = (_magnitudes(args, y) for y in (y0, y1_candidate))
         measured = y_error.error is not None and self.is_adaptive
         scaled = self._scaled_error(args, y_error, magnitude, candidate) if measured else None
-        before, retries = controller_state
+        before, retries, free = controller_state
         keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
             t0, t1, magnitude, candidate, args, scaled, error_order, before
         )
@@ -118,7 +131,8 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             holds = jnp.all(jnp.isfinite(y1_candidate))
             holds = holds if y_error.opens is None else holds & (y_error.opens <= NEAR)
             result = diffrax.RESULTS.where(holds, result, diffrax.RESULTS.dt_min_reached)
-            return keep & holds, jnp.where(holds, next_t0, t0), next_t1, jump, (after, retries), result
+            state = ControlState(after, retries, free)
+            return keep & holds, jnp.where(holds, next_t0, t0), next_t1, jump, state, result
         near = jnp.minimum(args.accuracy.clearance, FEASIBLE * y_error.leaves)
         again = (y_error.passes < near) & (retries < MOST_RETRIES)
         end = t0 + y_error.retry * (t1 - t0)
@@ -127,15 +141,32 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             to_switch = t0 + y_error.switch * (t1 - t0)
             end = jnp.where(late, jnp.where(keep, to_switch, jnp.minimum(to_switch, next_t1)), end)
             again = again | late
+            free = jnp.where(late, jnp.maximum(free, t1 - t0), free)
+        free = jnp.where(keep, free, 0.0)
+        # Controllers around the innermost one have times of their own to end steps at.
+        longer = jnp.maximum(next_t1, next_t0 + free) if self.controller is self.innermost else next_t1
+        next_t1 = jnp.where(again, end, longer)
+        next_t0 = jnp.where(keep & jnp.logical_not(again), next_t0, t0)
+        next_t1, free = self._until_known(args, next_t0, next_t1, jnp.where(again, free, 0.0))
         either = lambda retry, otherwise: jax.tree.map(lambda a, b: jnp.where(again, a, b), retry, otherwise)
         return (
             keep & jnp.logical_not(again),
-            either(t0, next_t0),
-            either(end, next_t1),
+            next_t0,
+            next_t1,
             jump & jnp.logical_not(again),
-            (either(before, after), jnp.where(again, retries + 1, jnp.where(keep, 0, retries))),
+            ControlState(either(before, after), jnp.where(again, retries + 1, jnp.where(keep, 0, retries)), free),
             result,
         )
+
+    def _until_known(self, problem, t0, t1, free):
+        """The end of a step, at the next known time of a law at most, and how long a free one would be."""
+        if problem.times is None or not self.is_adaptive:
+            return t1, free
+        # One that rounding puts just ahead is where the step begins.
+        beyond = t0 + SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.abs(t0)
+        index = jnp.searchsorted(problem.times, beyond, side="right")
+        ahead = jnp.append(problem.times, jnp.inf)[index]
+        return jnp.minimum(t1, ahead), jnp.where(t1 > ahead, jnp.maximum(free, t1 - t0), free)
 
     def _scaled_error(self, problem, y_error, magnitude, candidate):
         """The error of q, v and internal states in their scales, with rounding taken off."""

@@ -7,7 +7,7 @@ A step that goes past a switch is tried again, up to there, and the next begins 
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,19 +17,25 @@ from jax import lax
 from jaxtyping import Float
 
 from linkax.equations.configuration import configure
+from linkax.equations.coordinates import retract
+from linkax.equations.internal_states import bound
 from linkax.equations.motion import Motion, move
 from linkax.equations.system import System
 from linkax.model.elements import Time
 from linkax.model.forces.force import AbstractForce, Load
 from linkax.simulation.integrate import impacts
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import positive_or_one
 
-SAMPLES = 8  # of a step: between two of them a force element must not switch twice
-ON_ULPS = 256.0  # of a switch: what counts as there
+SAMPLES = 8  # of a step, and of a window of it
+WINDOWS = 64  # of a step that are looked at
+ON_ULPS = 256.0  # what counts as there, in units of what rounding of the state changes
 START_ULPS = 1e5  # how far beyond a stop a run may begin, as rounding of its assembly
 TIME_ULPS = 8.0
 SHORTEN = 1e-3  # a step that begins past a switch
 ITERATIONS = 60
+PROBE = 1e-5  # relative change of numbers, by which it is seen what switches change with
+SEEDS = (0, 1)  # of their signs, so that changes that cancel in one do not in the other
 
 # What y keeps of switches: the side of each, 1 or −1, then the record of impacts (see `impacts`); () without switches.
 Sides = Float[Array, " kept"] | tuple[()]
@@ -74,6 +80,26 @@ def start_sides(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v:
     return jnp.concatenate([sides, jnp.zeros(2 * len(stops), q.dtype)]) if len(stops) else sides
 
 
+class _Search(NamedTuple):
+    """A search for the first place of a step past a switch, in a window of it at a time.
+
+    - `count`: of windows. `left`: values of the switches at samples of the whole step, (SAMPLES + 1, m).
+    - `pending`: intervals between them in which a switch may be passed and come back, (SAMPLES, m).
+    - `switch`, `ends`: the window looked at, for one switch, by shares of the step.
+    - `before`, `past`: (share, least value), of the last sample before a switch is passed, and the first after it.
+    """
+
+    count: Array
+    left: Array
+    pending: Array
+    switch: Array
+    ends: tuple[Array, Array]
+    before: tuple[Array, Array]
+    past: tuple[Array, Array]
+    finds: Array
+    goes_on: Array
+
+
 def meet(
     problem: Problem,
     t0: Float[Array, ""],
@@ -89,41 +115,134 @@ def meet(
     **Returns:** the share of the step up to the first switch, one for none; the sides after a step that goes past none,
     with impacts counted, and not yet happened.
     """
-    kept, on = problem.sides(y0), ON_ULPS * jnp.finfo(y0.dtype).eps
+    kept, eps = problem.sides(y0), jnp.finfo(y0.dtype).eps
     stops, num = impacts.places(problem.system), sum(force.has_switch for force in problem.system.forces)
     sides = kept[:num]
     duration = t1 - t0
-    inside = lambda share: sides * problem.switches(t0 + share * duration, within(t0 + share * duration))
-    shares = jnp.asarray(np.linspace(0.0, 1.0, SAMPLES + 1), t1.dtype)
-    left = jnp.concatenate([jax.vmap(inside)(shares[:-1]), (sides * problem.switches(t1, y1))[None]])
-    nearest = jnp.min(left, axis=1)
-    past = nearest[1:] < -on
-    first = jnp.argmax(past)
+    at_end = problem.switches(t1, y1)
+    # In units of what rounding makes of each, so that the unit of a switch does not matter.
+    ulps = sides / positive_or_one(eps * _sensitivity(problem, t0, t1, y0, y1, at_end))
+    inside = lambda share: ulps * problem.switches(t0 + share * duration, within(t0 + share * duration))
+    at_end = ulps * at_end
+    search = _searched(inside, at_end, 2.0 * TIME_ULPS * eps)
 
     def closer(carry):
-        count, a, of_a, b, of_b, _ = carry
-        c = jnp.clip(b - of_b * (b - a) / (of_b - of_a), a, b)
+        count, (a, of_a), (b, of_b), _ = carry
+        # From where the switch is as good as there, and leaves it, to where it comes back.
+        leaves = of_a <= ON_ULPS
+        c = jnp.where(leaves, (a + b) / 2.0, jnp.clip(b - of_b * (b - a) / (of_b - of_a), a, b))
         of_c = jnp.min(inside(c))
         # False position, which halves the value of an end that stays (the Illinois method).
         before = of_c > 0.0
-        a, of_a, b, of_b = jax.tree.map(
-            lambda after, ahead: jnp.where(before, after, ahead), (c, of_c, b, of_b / 2.0), (a, of_a / 2.0, c, of_c)
+        ends = jax.tree.map(
+            lambda after, ahead: jnp.where(before, after, ahead),
+            ((c, of_c), (b, of_b / 2.0)),
+            ((a, of_a / 2.0), (c, of_c)),
         )
-        count = jnp.where((jnp.abs(of_c) <= on / 4.0) | (b <= a), ITERATIONS, count + 1)
-        return count, a, of_a, b, of_b, c
+        found = (jnp.abs(of_c) <= ON_ULPS / 4.0) & ~(leaves & before)
+        return jnp.where(found | (b <= a), ITERATIONS, count + 1), *ends, c
 
-    begin = jnp.where(jnp.any(past), 0, ITERATIONS), shares[first], jnp.maximum(nearest[first], 0.0)
-    begin = (*begin, shares[first + 1], nearest[first + 1], shares[first + 1])
+    (a, of_a), past = search.before, search.past
+    begin = jnp.where(search.finds, 0, ITERATIONS), (a, jnp.maximum(of_a, 0.0)), past, past[0]
     *_, share = lax.while_loop(lambda carry: carry[0] < ITERATIONS, closer, begin)
-    least = TIME_ULPS * jnp.finfo(t1.dtype).eps * jnp.maximum(jnp.abs(t1), duration)
-    resolved = jnp.any(past) & ((1.0 - share) * duration > least)
-    arrives = (left[-1] <= on) & (left[-1] < left[-2])
+    least = TIME_ULPS * eps * jnp.maximum(jnp.abs(t1), duration)
+    resolved = search.finds & ((1.0 - share) * duration > least)
+    arrives = (at_end <= ON_ULPS) & (at_end < jnp.max(search.left[:-1], axis=0))
     after = kept.at[:num].set(jnp.where(arrives, -sides, sides))
     if len(stops):
         after = after.at[stops].set(sides[stops]).at[num : num + len(stops)].add(arrives[stops])
-    # A step that would end where it begins would be followed by none but such.
-    shortest = jnp.maximum(SHORTEN, least / (2.0 * duration))
+    # A step that begins past a switch, and would end where it begins, would be followed by none but such.
+    shortest = jnp.maximum(jnp.where(jnp.min(search.left[0]) < 0.0, SHORTEN, 0.0), least / (2.0 * duration))
     return jnp.where(resolved, jnp.maximum(share, shortest), 1.0), after
+
+
+def _sensitivity(problem, t0, t1, y0, y1, at_end):
+    """By how much more than itself a small relative change of all numbers changes each switch, (m,): an estimate.
+
+    All are the state, the time, and the numbers of force elements, each changed up or down at random. A switch that
+    none of these change has what it changes in the step.
+    """
+    (q, v), internal = problem.unpacked(y1), problem.internal(y1)
+    system = problem.system
+
+    def changed(seed):
+        random = np.random.default_rng(seed)
+        either = lambda number: PROBE * random.choice([-1.0, 1.0], np.shape(number))
+        other = lambda leaf: leaf * (1.0 + either(leaf)) if eqx.is_inexact_array(leaf) else leaf
+        forces = jax.tree.map(other, system.forces)
+        near = dataclasses.replace(system, forces=forces, known=None)
+        near = near if internal is None else bound(near, other(internal))
+        turned = either(v) * system.scales
+        return values(near, other(t1), retract(system.topology, q, turned), v + system.fastest(v) * turned)
+
+    moved = jnp.stack([jnp.abs(changed(seed) - at_end) for seed in SEEDS])
+    return jnp.maximum(jnp.max(moved, axis=0) / PROBE, jnp.abs(at_end - problem.switches(t0, y0)))
+
+
+def _searched(inside, at_end, narrowest) -> _Search:
+    """Look for the first sample past a switch: of the step, then of intervals in which one may be passed and come back.
+
+    Between two samples a value may fall as fast as it changes beside them, and no faster while the gap of two convex
+    bodies, or what else is convex in time, is small. Intervals in which that may lead past zero are sampled, until one
+    sample is past it or none may be. `narrowest`: the share of a step that is as good as nothing.
+    """
+    places = jnp.asarray(np.linspace(0.0, 1.0, SAMPLES + 1), at_end.dtype)
+    zero, one = jnp.zeros_like(at_end[0]), jnp.ones_like(at_end[0])
+    num = len(at_end)
+
+    def look(search):
+        a, b = search.ends
+        first = search.count == 0
+        shares = a + places * (b - a)
+        values = jax.vmap(inside)(shares)
+        values = values.at[-1].set(jnp.where(first, at_end, values[-1]))
+        nearest = jnp.min(values, axis=1)
+        past = nearest[1:] < -ON_ULPS
+        finds, place = jnp.any(past), jnp.argmax(past)
+        slack = _slack(values)
+        pending = jnp.where(first, slack < 0.0, search.pending)
+        # Of the switch looked at, the interval where it may go farthest past; where there is none, a pending one.
+        own = slack[:, search.switch]
+        deeper = ~first & jnp.any(own < 0.0) & ((b - a) > narrowest)
+        chosen = jnp.argmin(own)
+        waiting = jnp.argmax(pending.reshape(-1))
+        interval, switch = waiting // num, waiting % num
+        ends = (
+            jnp.where(deeper, shares[chosen], places[interval]),
+            jnp.where(deeper, shares[chosen + 1], places[interval + 1]),
+        )
+        return _Search(
+            search.count + 1,
+            jnp.where(first, values, search.left),
+            jnp.where(deeper, pending, pending.at[interval, switch].set(False)),
+            jnp.where(deeper, search.switch, switch),
+            ends,
+            (shares[place], nearest[place]),
+            (shares[place + 1], nearest[place + 1]),
+            finds,
+            ~finds & (deeper | jnp.any(pending)),
+        )
+
+    begin = _Search(
+        jnp.zeros((), int),
+        jnp.zeros((SAMPLES + 1, num), at_end.dtype),
+        jnp.zeros((SAMPLES, num), bool),
+        jnp.zeros((), int),
+        (zero, one),
+        (zero, zero),
+        (one, one),
+        jnp.zeros((), bool),
+        jnp.ones((), bool),
+    )
+    return lax.while_loop(lambda search: search.goes_on & (search.count < WINDOWS), look, begin)
+
+
+def _slack(values):
+    """How far values stay from zero between each two samples, at least, (SAMPLES, m); negative where they may pass."""
+    changes = jnp.abs(jnp.diff(values, axis=0))
+    beside = jnp.pad(changes, ((1, 1), (0, 0)))
+    steepest = jnp.maximum(changes, jnp.maximum(beside[:-2], beside[2:]))
+    return jnp.minimum(values[:-1], values[1:]) - steepest
 
 
 def crossed(

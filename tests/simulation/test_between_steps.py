@@ -1,0 +1,104 @@
+"""What happens between steps is not passed over: thin obstacles, pulses of known times, switches of any unit."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mechanisms import pendulum
+
+import linkax as lx
+
+THROWS = 200
+RADIUS = 0.05  # of a ball and of a post
+LAW = lx.ContactLaw(stiffness=1e7, restitution=0.8, impact_speed=10.0)
+
+
+def thrown(numbers, stop):
+    """A ball thrown at 10 m/s, with a post of random width somewhere on its way, off its centre by at most half."""
+    time, off, width = 0.1 + 0.8 * numbers[0], numbers[1] - 0.5, RADIUS * (0.02 + numbers[2])
+    centre = jnp.stack([10.0 * time, 4.0 * time - 5.0 * time**2 + off * (RADIUS + width), 0.0 * time])
+    ball = lx.RigidBody("ball", 1.0, inertia=[0.01, 0.01, 0.01])
+    post = lx.Sphere(lx.GROUND.at(centre), width)
+    gravity = lx.Gravity([0.0, -10.0, 0.0])
+    return lx.Mechanism(
+        [ball], [lx.Rectangular("free", lx.GROUND, ball, axis="z")], [gravity, stop(lx.Sphere(ball, RADIUS), post)]
+    )
+
+
+STOPS = {
+    "impact": lambda *shapes: lx.Impact(*shapes, restitution=0.8),
+    "contact": lambda *shapes: lx.Contact(*shapes, LAW),
+}
+
+
+@pytest.mark.parametrize("stop", STOPS.values(), ids=STOPS)
+def test_no_thin_obstacle_is_passed_through(stop):
+    """In free flight there is no error, and a step takes as much as the whole run."""
+
+    def end(numbers):
+        start = lx.State(jnp.zeros(2), jnp.array([10.0, 4.0]))
+        return lx.simulate(thrown(numbers, stop), start, t1=1.0, saveat=diffrax.SaveAt(t1=True)).end.v
+
+    speeds = jax.jit(jax.vmap(end))(np.random.default_rng(0).uniform(size=(THROWS, 3)))
+    assert np.max(speeds[:, 0]) < 9.9
+
+
+def shared(pulse):
+    return lambda t, motion: 2.0 * pulse(t)
+
+
+@pytest.mark.parametrize("law", [lx.PiecewiseLinear, lx.Spline])
+@pytest.mark.parametrize("read", [lambda law: law, shared], ids=["the law", "a function that reads it"])
+@pytest.mark.parametrize("accuracy", [lx.DRAFT, lx.PRECISE])
+def test_a_pulse_at_known_times_is_not_stepped_over(law, read, accuracy):
+    """The end's speed is the area of the pulse over the inertia, at any tolerance."""
+    pulse = law([0.0, 0.7, 0.705, 0.71, 2.0], [0.0, 0.0, 100.0, 0.0, 0.0])
+    arm = pendulum(gravity=0.0, forces=[lx.JointTorque("hinge", read(pulse))])
+    run = lx.simulate(arm, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=2.0, accuracy=accuracy)
+    ts = np.linspace(0.0, 2.0, 2_000_001)
+    area = np.trapezoid(np.asarray(jax.vmap(pulse)(ts)), ts) * (2.0 if read is shared else 1.0)
+    np.testing.assert_allclose(run.end.v[0], 3.0 * area, rtol=1e-6)
+    assert law is lx.Spline or run.stats["num_steps"] < 20
+
+
+class Push(lx.AbstractForce):
+    """A constant push along a joint while it moves forwards; `unit`: what its switch counts in."""
+
+    joint: str = eqx.field(static=True)
+    unit: float
+
+    @property
+    def terms(self):
+        return (lx.Term(self.joint, 0),)
+
+    def switch(self, t, motion):
+        return self.unit * motion.joint_speed(self.joint)
+
+    def load(self, t, motion, on):
+        return motion.joint_load(self.terms[0], jnp.where(on, 1000.0, 0.0))
+
+
+def test_the_unit_of_a_switch_does_not_matter():
+    """A piston that is pushed while it moves outwards, through many dead centres."""
+    crank, rod, piston = lx.RigidBody("crank", 1.0, inertia=1.0), lx.rod("rod", 0.2, 0.5), lx.point_mass("piston", 1.0)
+    joints = [
+        lx.Revolute("bearing", lx.GROUND, crank, axis="z"),
+        lx.Revolute("big", crank.at([0.1, 0.0, 0.0]), rod.at("base"), axis="z"),
+        lx.Revolute("small", rod.at("tip"), piston, axis="z"),
+        lx.Prismatic("slide", lx.GROUND, piston, axis="x"),
+    ]
+
+    @jax.jit
+    @jax.vmap
+    def run(unit):
+        engine = lx.Mechanism([crank, rod, piston], joints, [Push("slide", unit)])
+        start = lx.assemble(engine, {"bearing": 0.3}, {"bearing": 10.0}, guess={"slide": 0.3})
+        found = lx.simulate(engine, start, t1=3.0, saveat=diffrax.SaveAt(t1=True), throw=False)
+        return found.joint("bearing")[-1], found.stats["num_steps"], found.result == lx.RESULTS.successful
+
+    angle, steps, well = run(10.0 ** np.arange(-6.0, 7.0, 3.0))
+    assert np.all(well)
+    np.testing.assert_allclose(angle, np.full(5, angle[2]), rtol=1e-9)
+    assert np.max(steps) < 30.0 * angle[2] / (2.0 * np.pi)
