@@ -51,6 +51,39 @@ def test_derivative_of_a_frequency_beside_what_nothing_holds(derivative):
     np.testing.assert_allclose(derivative(frequency)(MODULUS), FREQUENCY / (2.0 * MODULUS), rtol=1e-9)
 
 
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_derivatives_of_equal_eigenvalues_are_marked(derivative):
+    """Of √(4 ± p), equal at p = 0, and of ones equal but for rounding; 3 √(1 + p) beside them has its own."""
+
+    def frequencies(p, turn=0.0):
+        c, s = jnp.cos(turn), jnp.sin(turn)
+        axes = jnp.eye(3).at[:2, :2].set(jnp.array([[c, -s], [s, c]]))
+        stiffness = axes @ jnp.diag(jnp.stack([4.0 + p, 4.0 - p, 9.0 * (1.0 + p)])) @ axes.T
+        found = lx.Linearisation(jnp.zeros(3), jnp.eye(3), jnp.eye(3), stiffness, jnp.zeros((3, 3)))
+        return jnp.sort(found.eigenvalues.imag)[3:]
+
+    for turn in (0.0, 0.3):
+        slopes = derivative(frequencies)(0.0, turn)
+        np.testing.assert_allclose(slopes, [np.nan, np.nan, 1.5], rtol=1e-12)
+    np.testing.assert_allclose(derivative(frequencies)(1e-3), [-0.25, 0.25, 1.5], rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_derivatives_of_equal_frequencies_are_marked():
+    """Of masses on springs of their own, two of them alike."""
+
+    def frequencies(stiffness):
+        bodies = [lx.point_mass(name, 1.0) for name in "abc"]
+        joints = [lx.Prismatic(f"along {body.name}", lx.GROUND, body, "x") for body in bodies]
+        springs = [lx.JointSpring(joint.name, stiffness[index], 0.0) for index, joint in enumerate(joints)]
+        state = lx.State(np.zeros(3), np.zeros(3))
+        found = lx.linearise(lx.Mechanism(bodies, joints, springs), state, degrees_of_freedom=3)
+        return found.natural_frequencies
+
+    slopes = jax.jit(jax.jacfwd(frequencies))(jnp.array([4.0, 4.0, 9.0]))
+    np.testing.assert_allclose(slopes, [3 * [np.nan], 3 * [np.nan], [0.0, 0.0, 1.0 / 6.0]], atol=1e-12)
+
+
 WEIGHT = 3.0 * 9.81 * 0.5  # of a pendulum of 3 kg and 1 m, as a torque
 
 

@@ -5,42 +5,68 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Complex, Float
 
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
+from linkax.xla.undefined import undefined_where
 
 GROWS = 1e-6  # |Re λ| / |λ| up to which a motion neither grows nor decays
+
+EQUAL_ULPS = 100.0  # distance between eigenvalues, in what rounding moves them by, up to which they are equal
 
 _eig = one_by_one(lambda matrix: tuple(jnp.linalg.eig(matrix)))
 
 
-@jax.custom_jvp
 def _spectrum(matrix):
-    """Eigenvalues and eigenvectors of a matrix, differentiable to any order where no two are equal.
+    """Eigenvalues and eigenvectors of a matrix, differentiable to any order; derivatives of equal ones are NaN."""
+    found = _eigenpairs(matrix)
+    equal = _equal_another(*lax.stop_gradient((matrix, *found)))
+    return undefined_where((equal, equal), found, matrix)
 
-    The first derivative of an eigenvalue asks only that no other equals it.
-    """
+
+def _left(matrix, values):
+    """Left eigenvectors, as columns."""
+    found, left = _eigenpairs(matrix.T)
+    return left[:, jnp.argmin(jnp.abs(values[:, None] - found[None, :]), axis=1)]
+
+
+def _equal_another(matrix, values, vectors):
+    """Whether each eigenvalue is as close to another as rounding moves it, by ε |w|ᵀ |A| |v| / |wᵀ v|."""
+    left = _left(matrix, values)
+    moved = jnp.sum(jnp.abs(left) * (jnp.abs(matrix) @ jnp.abs(vectors)), axis=0) / jnp.abs(
+        jnp.sum(left * vectors, axis=0)
+    )
+    apart = jnp.abs(values[:, None] - values[None, :]) + jnp.diag(jnp.full(len(values), jnp.inf, matrix.dtype))
+    return jnp.logical_not(jnp.min(apart, axis=1) > EQUAL_ULPS * jnp.finfo(matrix.dtype).eps * moved)
+
+
+@jax.custom_jvp
+def _eigenpairs(matrix):
     return _eig(matrix)
 
 
-@_spectrum.defjvp
-def _spectrum_jvp(primals, tangents):
-    """Of an eigenvalue by its left eigenvector w: λ̇ = wᵀ Ȧ v / wᵀ v.
+@_eigenpairs.defjvp
+def _eigenpairs_jvp(primals, tangents):
+    """Of each eigenvalue λ by itself: (A − λ) v̇ − λ̇ v = −Ȧ v and wᵀ v̇ = 0, w its left eigenvector.
 
-    The inverse of all eigenvectors has w too, but is none where two others are parallel, as those of a double zero are.
+    That has one solution whatever the others are, such as a double zero, whose eigenvectors are parallel.
     """
     (matrix,), (change,) = primals, tangents
-    values, vectors = _spectrum(matrix)
-    left_values, left = _spectrum(matrix.T)
-    left = left[:, jnp.argmin(jnp.abs(values[:, None] - left_values[None, :]), axis=1)]
-    moved = change.astype(vectors.dtype) @ vectors
-    slopes = jnp.sum(left * moved, axis=0) / jnp.sum(left * vectors, axis=0)
-    rotated = jnp.linalg.solve(vectors, moved)
-    apart = values[None, :] - values[:, None] + jnp.eye(len(values), dtype=values.dtype)
-    mixed = jnp.where(jnp.eye(len(values), dtype=bool), 0.0, rotated / apart)
-    return (values, vectors), (slopes, vectors @ mixed)
+    values, vectors = _eigenpairs(matrix)
+    unit = jnp.eye(len(values) + 1, dtype=values.dtype)
+
+    def slopes(each):
+        value, vector, left, equal = each
+        shifted = matrix - value * unit[1:, 1:]
+        bordered = jnp.block([[shifted, -vector[:, None]], [left[None], jnp.zeros((1, 1), values.dtype)]])
+        right = jnp.pad(change.astype(values.dtype) @ vector, (0, 1))
+        return -jnp.linalg.solve(jnp.where(equal, unit, bordered), right)
+
+    found = lax.map(slopes, (values, vectors.T, _left(matrix, values).T, _equal_another(matrix, values, vectors)))
+    return (values, vectors), (found[:, -1], found[:, :-1].T)
 
 
 def _table(found: "Linearisation") -> Table:
@@ -90,7 +116,8 @@ class Linearisation(NamedTuple):
     and what they stiffen, are in K, gyroscopic terms in D, as its skew part. `natural_frequencies` leave out the
     symmetric part of D, and the skew part of K, which dampers have that do not rotate with the bodies.
 
-    Differentiable where no two frequencies are equal.
+    Differentiable, but for frequencies and eigenvalues that equal another one up to rounding, and their modes and
+    eigenvectors, whose derivatives are NaN.
     """
 
     natural_frequencies: Float[Array, " d"]

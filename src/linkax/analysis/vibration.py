@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import ArrayLike, Bool, Float
 
-from linkax.analysis.linearisation import Linearisation, StateSlopes, gyroscopic_frequencies, state_matrix
+from linkax.analysis.linearisation import EQUAL_ULPS, Linearisation, StateSlopes, gyroscopic_frequencies, state_matrix
 from linkax.analysis.steady import (
     AGREES,
     Nearby,
@@ -43,6 +43,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, concrete
+from linkax.xla.undefined import undefined_where
 
 NEAR = 1e-6  # distance from an equilibrium up to which a state counts as in it [rad, lengths of the mechanism]
 UNFELT = 1e-9  # forces that rounding leaves, relative to all forces
@@ -291,6 +292,10 @@ def _frequencies(moving, basis, symmetric, damping, may_couple):
     # The eigenproblem that is not used gets eigenvalues apart from each other, so that its derivatives are finite.
     apart = jnp.diag(jnp.arange(1.0, len(symmetric) + 1.0, dtype=system.dtype) ** 2)
     values, vectors = eigh(jnp.where(couples, apart, symmetric))
+    steps = jnp.diff(lax.stop_gradient(values), prepend=-jnp.inf, append=jnp.inf)
+    near = steps <= EQUAL_ULPS * jnp.finfo(system.dtype).eps * largest(lax.stop_gradient(values))
+    equal = near[1:] | near[:-1]
+    values, vectors = undefined_where((equal, equal), (values, vectors), symmetric)
     frequencies = jnp.sign(values) * jnp.sqrt(jnp.where(values == 0.0, 1.0, jnp.abs(values)))
     if may_couple:
         matrix = state_matrix(jnp.where(couples, symmetric, apart), jnp.where(couples, gyroscopic, 0.0))

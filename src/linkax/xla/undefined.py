@@ -48,7 +48,9 @@ def _undefined_where_jvp(primals, tangents):
 
 
 def _spoil(undefined, linear):
-    return jnp.where(undefined, jnp.nan, linear[:-1])
+    # In both parts of a complex number.
+    nan = complex(jnp.nan, jnp.nan) if jnp.iscomplexobj(linear) else jnp.nan
+    return jnp.where(undefined, jnp.asarray(nan, linear.dtype), linear[:-1])
 
 
 def _abstract(undefined, linear):
