@@ -1,8 +1,8 @@
 """Mechanisms of the tests, whose names and numbers are traced alike wherever they are used, and so share programs.
 
-A pendulum, a crank-slider, a four-bar, a coupler between balls, a Sarrus linkage; Bricard's, the spatial four-link,
-rows of four-bars and cranes are scenes (`known_answers.start`). `POOL` has random ones, with all joints, beams, forces
-and constraints, for laws that hold for all of them.
+A pendulum, a crank-slider, a sleigh, a rolling disc, a four-bar, a coupler between balls, a Sarrus linkage; Bricard's,
+the spatial four-link, rows of four-bars and cranes are scenes (`known_answers.start`). `POOL` has random ones, with all
+joints, beams, forces and constraints, for laws that hold for all of them.
 """
 
 import copy
@@ -41,6 +41,41 @@ def crank_slider(
         lx.Prismatic("guide", lx.GROUND.at(offset), slider, axis="x", **options("guide")),
     ]
     return lx.Mechanism([bar, link, slider], joints[::order], [down(9.81), *forces], constraints)
+
+
+def sleigh(apart):
+    """A plate on an edge, its centre of mass `apart` ahead of it; it turns at 2 rad/s and goes at 0.5 m/s."""
+    plate = lx.RigidBody("plate", 2.0, jnp.array([1.0, 0.0, 0.0]) * apart, 0.3)
+    ice = lx.Planar("ice", lx.GROUND, plate, "z")
+    mechanism = lx.Mechanism([plate], [ice], constraints=[lx.Skate("edge", plate, lx.GROUND)])
+    return mechanism, lx.State(jnp.zeros(3), jnp.array([2.0, 0.5, 0.0]))
+
+
+def rolling_disc(tilt, turning, spin, radius=0.4, mass=1.5):
+    """A thin disc that rolls with precession `turning` about the vertical, and a rate `spin` about its axis z.
+
+    It heads along y, and leans to x by `tilt`.
+    """
+    axial, across = mass * radius**2 / 2.0, mass * radius**2 / 4.0
+    disc = lx.RigidBody("disc", mass, inertia=[across, across, axial])
+    rolling = lx.RollingDisc("rolling", disc, lx.GROUND, radius)
+    joint = lx.Free("flight", lx.GROUND, disc)
+    mechanism = lx.Mechanism([disc], [joint], [lx.Gravity([0.0, 0.0, -9.81])], [rolling])
+    sine, cosine, half = jnp.sin(tilt), jnp.cos(tilt), tilt / 2.0 - jnp.pi / 4.0
+    omega = turning * jnp.array([0.0, 0.0, 1.0]) + spin * jnp.stack([-cosine, 0.0 * sine, sine])
+    centre = radius * jnp.stack([sine, 0.0 * sine, cosine])
+    turn = jnp.stack([jnp.cos(half), 0.0 * half, jnp.sin(half), 0.0 * half])
+    return mechanism, lx.State(jnp.append(turn, centre), jnp.append(omega, jnp.cross(omega, centre)))
+
+
+def steady_spin(tilt, turning, radius=0.4):
+    """The rate about the axis at which a uniform thin disc keeps its tilt α, at a precession Ω (Routh, art. 244).
+
+    Moments about the contact: (C + m r²) n Ω cos α = A Ω² sin α cos α − m g r sin α, n the rate about the axis in all.
+    """
+    sine, cosine = np.sin(tilt), np.cos(tilt)
+    needed = radius**2 / 4.0 * turning**2 * sine * cosine - 9.81 * radius * sine
+    return needed / (1.5 * radius**2 * turning * cosine) - turning * sine
 
 
 def four_bar(

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from mechanisms import rolling_disc, sleigh, steady_spin
 
 import linkax as lx
 
@@ -16,14 +16,6 @@ SAVES = diffrax.SaveAt(ts=jnp.asarray(TS))
 
 def run(mechanism, state, accuracy=lx.PRECISE):
     return lx.simulate(mechanism, state, t1=2.0, accuracy=accuracy, saveat=SAVES)
-
-
-def sleigh(apart):
-    """A plate on an edge, its centre of mass `apart` ahead of it; it turns at 2 rad/s and goes at 0.5 m/s."""
-    plate = lx.RigidBody("plate", 2.0, jnp.array([1.0, 0.0, 0.0]) * apart, 0.3)
-    ice = lx.Planar("ice", lx.GROUND, plate, "z")
-    mechanism = lx.Mechanism([plate], [ice], constraints=[lx.Skate("edge", plate, lx.GROUND)])
-    return mechanism, lx.State(jnp.zeros(3), jnp.array([2.0, 0.5, 0.0]))
 
 
 def test_chaplygins_sleigh():
@@ -48,41 +40,11 @@ def test_chaplygins_sleigh():
     np.testing.assert_allclose(solution.reaction("edge"), across, atol=1e-8)
 
 
-def tilted(tilt):
-    """Axes of a disc, z its axis, at a tilt of its plane from the vertical, heading along y, leaning to x."""
-    c, s = np.cos(tilt), np.sin(tilt)
-    return np.array([[s, 0.0, -c], [0.0, 1.0, 0.0], [c, 0.0, s]])
-
-
-def disc_rolling(tilt, turning, spin, radius=0.4, mass=1.5):
-    """A disc that rolls with precession `turning` about the vertical, and a rate `spin` about its axis."""
-    axial, across = mass * radius**2 / 2.0, mass * radius**2 / 4.0
-    disc = lx.RigidBody("disc", mass, inertia=[across, across, axial])
-    rolling = lx.RollingDisc("rolling", disc, lx.GROUND, radius)
-    mechanism = lx.Mechanism([disc], [lx.Free("flight", lx.GROUND, disc)], [GRAVITY], [rolling])
-    axes = tilted(tilt)
-    omega = turning * np.array([0.0, 0.0, 1.0]) + spin * axes[:, 2]
-    contact = -radius * axes[:, 0]
-    velocity = -np.cross(omega, contact)
-    x, y, z, w = Rotation.from_matrix(axes).as_quat()
-    return mechanism, lx.State(np.array([w, x, y, z, *-contact]), np.concatenate([omega, velocity]))
-
-
-def steady_spin(tilt, turning, radius=0.4):
-    """The rate about the axis at which a uniform thin disc keeps its tilt α, at a precession Ω (Routh, art. 244).
-
-    Moments about the contact: (C + m r²) n Ω cos α = A Ω² sin α cos α − m g r sin α, n the rate about the axis in all.
-    """
-    sine, cosine = np.sin(tilt), np.cos(tilt)
-    needed = radius**2 / 4.0 * turning**2 * sine * cosine - 9.81 * radius * sine
-    return needed / (1.5 * radius**2 * turning * cosine) - turning * sine
-
-
 @pytest.mark.slow
 def test_a_disc_rolls_steadily():
     """The tilt stays, and the centre goes around in a circle."""
     tilt, turning = 0.35, 1.8
-    mechanism, state = disc_rolling(tilt, turning, steady_spin(tilt, turning))
+    mechanism, state = rolling_disc(tilt, turning, steady_spin(tilt, turning))
     assert lx.mobility(mechanism, state).degrees_of_freedom == 3
     solution = run(mechanism, state)
     np.testing.assert_allclose(solution.position("disc")[:, 2], 0.4 * np.cos(tilt), atol=1e-8)
@@ -98,7 +60,7 @@ def test_a_disc_rolls_steadily():
 def test_a_disc_rolls_upright_from_a_speed_on(share):
     """Upright it is stable where ω² > A m g r / (C (C + m r²)), of a uniform thin disc g / (3 r)."""
     spin = share * np.sqrt(9.81 / (3.0 * 0.4))
-    mechanism, state = disc_rolling(1e-5, 0.0, spin)
+    mechanism, state = rolling_disc(1e-5, 0.0, spin)
     found = lx.simulate(mechanism, state, t1=6.0)
     lean = np.abs(1.0 - 2.0 * np.sum(np.asarray(found.q)[:, 1:3] ** 2, axis=1))  # of a quaternion: what z has of z
     assert (np.max(lean) > 1e-3) == (share < 1.0)

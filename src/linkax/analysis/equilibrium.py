@@ -176,11 +176,11 @@ def _equilibrium(mechanism, state, t, moves):
 def _changes(system, method, t, q, v):
     """The largest force, relative to all forces, and gap of the loops as the motion goes on at speeds v."""
 
-    def at(instant):
-        later = Balanced.of(system, method, instant.t, retract(system.topology, q, instant.motion))
+    def at(duration):
+        later = Balanced.of(system, method, t + duration, retract(system.topology, q, duration * v))
         zero = jnp.zeros_like(v)
         scale, left = largest_force(later.motion(zero)[0]), jnp.max(jnp.abs(later.force(zero)), initial=0.0)
-        gap = widest_gap(system, instant.t, later.q)
+        gap = widest_gap(system, later.t, later.q)
         return jnp.maximum(ratio(left, scale), gap)
 
-    return jnp.max(lax.map(at, instants(system, t, v)))
+    return jnp.max(lax.map(at, instants(system, v)))

@@ -85,7 +85,7 @@ def _table(found: "Linearisation") -> Table:
 
 
 class StateSlopes(NamedTuple):
-    """Small changes σ of the internal states of force elements: ÿ + D ẏ + K y = B σ, σ̇ = G y + H ẏ + S σ.
+    """Small changes σ of further states: ÿ + D ẏ + K y = B σ, σ̇ = G y + H ẏ + S σ.
 
     - `force`: B, (d, n_s). `by_coordinates`: G, (n_s, d). `by_speeds`: H, (n_s, d). `by_states`: S, (n_s, n_s) [1/s].
     """
@@ -107,14 +107,22 @@ class Linearisation(NamedTuple):
     - `modes`: speeds of the tree's joints in each mode, (n_v, d), scaled to vᵀ M v = 1. NaN where gyroscopic terms
       leave no modes in which all joints move in phase; see `eigenvectors` then.
     - `basis`: T, (n_v, d), with Tᵀ M T = 1. `stiffness`: K, (d, d) [1/s²]. `damping`: D, (d, d) [1/s].
-    - `states`: what internal states of force elements add, in the order of `State.internal`: their `force` B, (d, n_s),
-      and their rates G y + H ẏ + S σ, `by_coordinates`, `by_speeds` and `by_states`; None without any. All of the above
-      holds them constant; `eigenvalues` does not, so that |λ| has the natural frequency of a hydraulic cylinder.
+    - `states`: what further states σ add: their `force` B, (d, n_s), and their rates G y + H ẏ + S σ, `by_coordinates`,
+      `by_speeds` and `by_states`; None without any. They are the internal states of force elements, in the order of
+      `State.internal`, and after them displacements that slips bar, one for each row of slips. All of the above holds
+      them constant; `eigenvalues` does not, so that |λ| has the natural frequency of a hydraulic cylinder.
+
+    Slips, such as those of a skate or of a wheel that rolls, leave fewer speeds than displacements. There are d of
+    speeds, and y are displacements along them; those across change as the motion goes on: a skate that has turned goes
+    aside. They, and other coordinates that nothing depends on, have eigenvalues of zero, as has a row of slips that
+    others imply.
 
     About a steady motion, y are changes of the joints' coordinates that move with it, and frequencies are those seen
-    from the rotating bodies: a rotor that whirls at ω seen from the ground whirls at ω − Ω here. Centrifugal forces,
-    and what they stiffen, are in K, gyroscopic terms in D, as its skew part. `natural_frequencies` leave out the
-    symmetric part of D, and the skew part of K, which dampers have that do not rotate with the bodies.
+    from the rotating bodies: a rotor that whirls at ω seen from the ground whirls at ω − Ω here. Of a mechanism that
+    turns as one, with bodies that spin about axes of their own, such as a disc that rolls in a circle, y turn and do
+    not spin. Centrifugal forces, and what they stiffen, are in K, gyroscopic terms in D, as its skew part.
+    `natural_frequencies` leave out the symmetric part of D, and the skew part of K, which dampers have that do not
+    rotate with the bodies.
 
     Differentiable, but for frequencies and eigenvalues that equal another one up to rounding, and their modes and
     eigenvectors, whose derivatives are NaN.
@@ -129,7 +137,7 @@ class Linearisation(NamedTuple):
 
     @property
     def eigenvalues(self) -> Complex[Array, "*batch n"]:
-        """λ of the motions exp(λ t), with damping, gyroscopic terms and internal states, (2 d + n_s,) [1/s].
+        """λ of the motions exp(λ t), with damping, gyroscopic terms and further states, (2 d + n_s,) [1/s].
 
         A motion grows where Re λ > 0.
         """

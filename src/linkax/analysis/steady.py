@@ -1,8 +1,7 @@
-"""Recognise steady motion: joints go on at their speeds, as drives ask, and nothing else changes."""
+"""Recognise steady motion: drives are followed, and nothing changes as the motion goes on."""
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -51,8 +50,8 @@ def system_in(mechanism: Mechanism, state: State, t: Float[Array, ""], moves: bo
 class Nearby(eqx.Module):
     """A mechanism near coordinates q on the closed loops, in coordinates y of the tangent space: q ⊕ T y.
 
-    - `basis`: T, (n_v, n_v), columns orthonormal in a metric; columns beyond the degrees of freedom are zero.
-    - `dual`: its inverse on the tangent space, (n_v, n_v).
+    - `basis`: T, (n_v, n), columns orthonormal in a metric, or zero.
+    - `dual`: its inverse on the tangent space, (n, n_v).
     - `t`: time [s].
     """
 
@@ -60,10 +59,10 @@ class Nearby(eqx.Module):
     method: TangentSpace
     t: Float[Array, ""]
     q: Float[Array, " n_q"]
-    basis: Float[Array, "n_v n_v"]
-    dual: Float[Array, "n_v n_v"]
+    basis: Float[Array, "n_v n"]
+    dual: Float[Array, "n n_v"]
 
-    def at(self, y: Float[Array, " n_v"]) -> Float[Array, " n_q"]:
+    def at(self, y: Float[Array, " n"]) -> Float[Array, " n_q"]:
         """Coordinates of the tree's joints, q ⊕ T y."""
         return retract(self.system.topology, self.q, self.basis @ y)
 
@@ -74,20 +73,9 @@ class Nearby(eqx.Module):
         return jax.vmap(follow, out_axes=(None, 1))(jnp.eye(len(point), dtype=point.dtype))
 
 
-class Instants(NamedTuple):
-    """Later instants of a motion at constant speeds v.
-
-    - `t`: times [s]. `motion`: displacement of the joints until then, v Δt [rad or m].
-    """
-
-    t: Float[Array, " k"]
-    motion: Float[Array, "k n_v"]
-
-
-def instants(system: System, t: Float[Array, ""], v: Float[Array, " n_v"]) -> Instants:
-    """The instants at which the fastest joint has gone as far as `LATER` says."""
-    duration = ratio(LATER, lax.stop_gradient(system.fastest(v)), 0.0)
-    return Instants(t + duration, duration[:, None] * v)
+def instants(system: System, v: Float[Array, " n_v"]) -> Float[Array, " k"]:
+    """The times that the fastest joint needs at speeds v to go as far as `LATER` says [s]."""
+    return ratio(LATER, lax.stop_gradient(system.fastest(v)), 0.0)
 
 
 def widest_gap(system: System, t: Float[Array, ""], q: Float[Array, " n_q"]) -> Float[Array, ""]:

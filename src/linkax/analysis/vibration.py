@@ -3,11 +3,13 @@
 import dataclasses
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import ArrayLike, Bool, Float
+from jax.scipy.linalg import block_diag
+from jaxtyping import ArrayLike, Bool, Float, Int
 
 from linkax.analysis.linearisation import EQUAL_ULPS, Linearisation, StateSlopes, gyroscopic_frequencies, state_matrix
 from linkax.analysis.steady import (
@@ -22,14 +24,17 @@ from linkax.analysis.steady import (
     system_in,
     widest_gap,
 )
+from linkax.analysis.symmetry import Symmetry, find_turns
 from linkax.equations.configuration import configure
-from linkax.equations.coordinates import carried, retract
 from linkax.equations.internal_states import bound, internal_rates
 from linkax.equations.loops import jacobian
 from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
+from linkax.formulations.formulation import linear_system
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.constrained_solve import constrained_solve
+from linkax.linalg.pivoted_qr import pivoted_qr
+from linkax.linalg.saddle_inverse import invert_apart
 from linkax.linalg.triangular import cholesky_inverse_by_elimination
 from linkax.model.forces.internal_states import scales
 from linkax.model.mechanism import Mechanism
@@ -38,7 +43,7 @@ from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.initial_state import moving_joints
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
-from linkax.spatial.vectors import largest
+from linkax.spatial.vectors import largest, length
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.program import Program
@@ -48,65 +53,116 @@ from linkax.xla.undefined import undefined_where
 NEAR = 1e-6  # distance from an equilibrium up to which a state counts as in it [rad, lengths of the mechanism]
 UNFELT = 1e-9  # forces that rounding leaves, relative to all forces
 CONSTANT = 1e-5  # relative change of coefficients and loops up to which they count as constant
+IMPLIED_ULPS = 1e4  # mobility along a slip that rounding leaves where other rows imply it, of the largest one
 ROUNDING_ULPS = 1e5  # error of a stiffness, in units of rounding of the largest one
 
 
 class _Moving(Nearby):
     """A mechanism near coordinates q and speeds v.
 
-    T is orthonormal in the mass metric, Tᵀ M T = 1, also where the mechanism's numbers change.
+    T = [T_f, T_b] has the directions of the d speeds that constraints leave free, and those of displacements that slips
+    alone bar, one for each row of slips, zero where other rows imply it. Tᵀ M T = 1, also where the mechanism's numbers
+    change.
     """
 
-    v: Float[Array, " n_v"]
+    symmetry: Symmetry
+    degrees_of_freedom: int = eqx.field(static=True)
 
     @staticmethod
     def of(
-        system: System, method: TangentSpace, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
-    ) -> "_Moving":
+        system: System,
+        method: TangentSpace,
+        t: Float[Array, ""],
+        q: Float[Array, " n_q"],
+        v: Float[Array, " n_v"],
+        degrees_of_freedom: int,
+    ) -> tuple["_Moving", Int[Array, ""]]:
+        """The mechanism there, and how many degrees of freedom it has."""
         departure = method.at_rest(system, t, q)
-        split, mass = departure.split, departure.mass
-        fixed = split.inverse.basis
-        still = jnp.zeros(len(split.jacobian), mass.dtype)
+        rows, inverse, mass = departure.split.jacobian, departure.split.inverse, departure.mass
+        still, slips = jnp.zeros(len(rows), mass.dtype), system.topology.slips
 
         def tangent(column):
-            return constrained_solve(split.inverse, mass, split.jacobian, mass @ column, still)[0]
+            return constrained_solve(inverse, mass, rows, mass @ column, still)[0]
 
-        basis = jax.vmap(tangent, in_axes=1, out_axes=1)(fixed)
-        empty = jnp.diag((jnp.sum(fixed**2, axis=0) == 0.0).astype(mass.dtype))
-        basis = basis @ cholesky_inverse_by_elimination(basis.T @ mass @ basis + empty)[0].T
-        return _Moving(system, method, t, q, basis, basis.T @ mass, v)
+        empty = jnp.sum(inverse.basis**2, axis=0) == 0.0
+        fixed = inverse.basis[:, jnp.argsort(empty)[:degrees_of_freedom]]
+        basis = _orthonormal(jax.vmap(tangent, in_axes=1, out_axes=1)(fixed), mass)
+        if np.any(slips):
+            holds = jnp.where(slips[:, None], 0.0, rows)
+            barred = _barred(system, method.tolerance, mass, holds, rows[slips])
+            basis = jnp.concatenate([basis, _orthonormal(barred, mass)], axis=1)
+        symmetry = Symmetry.through(system, t, q, v)
+        moving = _Moving(system, method, t, q, basis, basis.T @ mass, symmetry, degrees_of_freedom)
+        return moving, jnp.sum(jnp.logical_not(empty))
 
-    def after(self, t: Float[Array, ""], motion: Float[Array, " n_v"]) -> "_Moving":
-        """The same mechanism at time t, displaced by `motion`, with T carried along."""
-        carry = lambda change: carried(self.system.topology, motion, change)
-        basis, dual = jax.vmap(carry, in_axes=1, out_axes=1)(self.basis), jax.vmap(carry)(self.dual)
-        q = retract(self.system.topology, self.q, motion)
+    @property
+    def v(self) -> Float[Array, " n_v"]:
+        return self.symmetry.speeds(self.q)
+
+    @property
+    def free(self) -> Float[Array, "n_v d"]:
+        """T_f."""
+        return self.basis[:, : self.degrees_of_freedom]
+
+    def after(self, duration: Float[Array, ""]) -> "_Moving":
+        """The same mechanism a time later [s], with T carried along."""
+        t, (q, basis) = self.t + duration, self.symmetry.follow(self.q, self.basis, duration)
+        dual = basis.T @ linear_system(self.system, t, q).mass
         return dataclasses.replace(self, t=t, q=q, basis=basis, dual=dual)
 
-    def acceleration(self, y: Float[Array, " n_v"], y_rate: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
-        """ÿ, in coordinates y that move with the steady motion: q(t) ⊕ T y."""
-        along = self.basis @ y_rate
-        _, acceleration, *_ = self.method.derivative(self.system, self.t, self.at(y), self.v + along, True)
-        if len(self.system.topology.quaternions):
-            carry = lambda time: carried(self.system.topology, time * self.v, along)
-            nothing = jnp.zeros((), y.dtype)
-            acceleration = acceleration - jax.jvp(carry, (nothing,), (nothing + 1.0,))[1]
-        return self.dual @ acceleration
+    def rates(
+        self, y: Float[Array, " h"], y_rate: Float[Array, " d"], internal: Float[Array, " n_s"] | None = None
+    ) -> tuple[Float[Array, " h"], Float[Array, " n_s"]]:
+        """ÿ of what is free and ẏ of what is barred, in coordinates y that move with the steady motion: q(t) ⊕ T y.
 
-    def coefficients(self) -> tuple[Float[Array, " n_v"] | Float[Array, "n_v n_v"], ...]:
-        """ÿ at y = ẏ = 0, the stiffness −∂ÿ/∂y and the damping −∂ÿ/∂ẏ."""
-        origin = jnp.zeros_like(self.system.scales)
-        of_both = lambda both: self.acceleration(*jnp.split(both, 2))
-        acceleration, slopes = self.slopes(of_both, jnp.concatenate([origin, origin]))
-        return acceleration, *jnp.split(-slopes, 2, axis=1)
+        And the rates of internal states, where some are given.
+        """
+        system, at = bound(self.system, internal), self.at(y)
+        moved = self.symmetry.speeds(at) + self.free @ y_rate
+        v, acceleration, q, _ = self.method.derivative(system, self.t, at, moved, True)
+        steady, rate = self.symmetry.along(q, v)
+        acceleration = acceleration - rate - self.symmetry.carry(self.q, v - steady)
+        free, barred = jnp.split(self.dual, [self.degrees_of_freedom])
+        changes = jnp.zeros(0, y.dtype) if internal is None else internal_rates(move(configure(system, self.t, q), v))
+        return jnp.concatenate([free @ acceleration, barred @ (v - steady)]), changes
+
+    def coefficients(self) -> tuple[Float[Array, " d"], Float[Array, "h h"], Float[Array, "h h"]]:
+        """ÿ at y = ẏ = 0, −∂/∂y of ÿ, with zeros below, and −∂/∂ẏ of it, with ∂/∂y of ẏ of what is barred below."""
+        count, degrees = self.basis.shape[1], self.degrees_of_freedom
+        of_both = lambda both: self.rates(*jnp.split(both, [count]))[0]
+        rates, slopes = self.slopes(of_both, jnp.zeros(count + degrees, self.basis.dtype))
+        by_place, by_rate = jnp.split(-slopes, [count], axis=1)
+        is_free = jnp.arange(count)[:, None] < degrees
+        damping = jnp.pad(by_rate, ((0, 0), (0, count - degrees)))
+        return rates[:degrees], jnp.where(is_free, by_place, 0.0), jnp.where(is_free, damping, -by_place)
 
     def opens(self) -> Float[Array, ""]:
         """The largest gap of the loops, rate that speeds miss, or slope at which T opens the loops."""
-        slopes = jacobian(configure(self.system, self.t, self.q)) @ self.basis
+        bars = self.system.topology.slips[:, None] & (np.arange(self.basis.shape[1]) >= self.degrees_of_freedom)
+        slopes = jnp.where(bars, 0.0, jacobian(configure(self.system, self.t, self.q)) @ self.basis)
         apart = ratio(largest(slopes), largest(self.basis / self.system.scales[:, None]))
         misses = missed_rates(self.system, self.t, self.q, self.v)
         gap = widest_gap(self.system, self.t, self.q)
         return jnp.maximum(jnp.maximum(apart, gap), jnp.max(misses, initial=0.0))
+
+
+def _orthonormal(columns, mass):
+    """The same directions, orthonormal in the mass metric; columns of zeros stay so."""
+    empty = jnp.diag((jnp.sum(columns**2, axis=0) == 0.0).astype(mass.dtype))
+    return columns @ cholesky_inverse_by_elimination(columns.T @ mass @ columns + empty)[0].T
+
+
+def _barred(system, tolerance, mass, rows, slips):
+    """Directions that `rows` leave free and `slips` do not, one for each of these, zero where the others imply it."""
+    inverse = invert_apart(mass, rows, system.scales, tolerance, system.structure.islands)
+    nothing = jnp.zeros(len(rows), mass.dtype)
+    across = jax.vmap(lambda slip: constrained_solve(inverse, mass, rows, slip, nothing)[0], out_axes=1)(slips)
+    unit = ratio(1.0, length(slips * system.scales))
+    _, r, order = pivoted_qr(lax.stop_gradient(unit[:, None] * slips @ across * unit))
+    mobility = largest(inverse.tangent / jnp.outer(system.scales, system.scales))
+    felt = jnp.abs(jnp.diagonal(r)) > IMPLIED_ULPS * jnp.finfo(mass.dtype).eps * mobility
+    return jnp.where(jnp.zeros(len(slips), bool).at[order].set(felt), across, 0.0)
 
 
 class _Steadiness(NamedTuple):
@@ -149,7 +205,7 @@ def linearise(
     **Returns:** a `Linearisation`.
 
     Internal states of force elements, such as pressures, are those of the state, and stand still there too; what they
-    add is in `states` and `eigenvalues`.
+    add, and what displacements that slips bar do, is in `states` and `eigenvalues`.
 
     **Raises:** `ValueError` for a state that is neither in equilibrium nor in steady motion. Inside JAX transformations
     nothing is raised, and the numbers are NaN.
@@ -161,7 +217,7 @@ def linearise(
             raise ValueError("linearise inside a JAX transformation needs degrees_of_freedom=; give their number")
         degrees_of_freedom = mechanism.topology.num_speeds - int(rank)
     asked = whole_number(degrees_of_freedom, "degrees_of_freedom", least=0)
-    linearisation, counted, steadiness = _linearise(mechanism, state, t, asked, may_move(state))
+    linearisation, steadiness, counted = _linearise(mechanism, state, t, asked, may_move(state))
     if concrete(counted) is not None and counted != asked:
         raise ValueError(f"degrees_of_freedom is {asked}; the mechanism has {counted} here: give that, or leave it out")
     if not all_concrete((linearisation, steadiness)):
@@ -218,72 +274,102 @@ def _rank(mechanism, state, t):
 
 @Program
 def _linearise(mechanism, state, t, count, moves):
-    """A `Linearisation`, the degrees of freedom counted at the state, and the `_Steadiness`."""
+    """A `Linearisation`, its `_Steadiness`, and the degrees of freedom counted at the state."""
     system = bound(system_in(mechanism, state, t, moves), state.internal)
     v = state.v if moves else jnp.zeros(system.topology.num_speeds, system.dtype)
-    moving = _Moving.of(system, TangentSpace().prepared(system.dtype), t, state.q, v)
-    empty = jnp.sum(moving.basis**2, axis=0) == 0.0
-    columns = jnp.argsort(empty)[:count]
-    (stiffness, damping), history = _coefficients(moving, columns, moves)
-    basis, symmetric = moving.basis[:, columns], (stiffness + stiffness.T) / 2.0
-    modes = _Modes.of(system, basis, lax.stop_gradient(symmetric), moving.v)
-    states, of_states, felt = None, jnp.zeros(0, system.dtype), 0.0
-    if state.internal is not None:
-        units = scales(mechanism.forces, system.dtype)
-        states, of_states = _states(moving, basis, moving.dual[columns], state.internal, units)
-        felt = jnp.abs(modes.vectors.T @ states.force) @ units
-    steadiness = _steadiness(moving, state, basis, modes, history, felt)._replace(of_states=of_states)
-    frequencies, mode_speeds = _frequencies(moving, basis, symmetric, damping, moves and count)
+    still, counted = _Moving.of(system, TangentSpace().prepared(system.dtype), t, state.q, v, count)
+    if not (moves and len(still.symmetry.turns)):
+        return *_of_moving(mechanism, state, still, moves), counted
+
+    def along(turns):
+        symmetry = still.symmetry.turning(state.q, turns)
+        return _of_moving(mechanism, state, dataclasses.replace(still, symmetry=symmetry), moves)
+
+    # All joints at constant speeds come first.
+    turns = find_turns(still.symmetry, system, still.method, t, state.q, still.basis, still.free)
+    turns = jnp.where(jnp.all(jnp.isfinite(turns)), turns, 0.0)
+    linearisations, steadiness = lax.map(along, jnp.stack([turns - lax.stop_gradient(turns), turns]))
+    needed = jnp.argmax(jax.vmap(lambda each: each.is_steady)(steadiness))
+    return *jax.tree.map(lambda leaf: leaf[needed], (linearisations, steadiness)), counted
+
+
+def _of_moving(mechanism, state, moving, moves):
+    """A `Linearisation` and its `_Steadiness`."""
+    system, count = moving.system, moving.degrees_of_freedom
+    (of_places, of_rates), history = _coefficients(moving, moves)
+    stiffness, damping = of_places[:count, :count], of_rates[:count, :count]
+    symmetric = (stiffness + stiffness.T) / 2.0
+    modes = _Modes.of(system, moving.free, lax.stop_gradient(symmetric), moving.v)
+    units = jnp.zeros(0, system.dtype) if state.internal is None else scales(mechanism.forces, system.dtype)
+    states, of_states = _states(moving, state.internal, units)
+    felt = jnp.abs(modes.vectors.T @ states.force) @ units
+    steadiness = _steadiness(moving, state, modes, history, felt)._replace(of_states=of_states)
+    frequencies, mode_speeds = _frequencies(moving, symmetric, damping, moves and count)
     linearisation = Linearisation(
         natural_frequencies=frequencies,
         modes=mode_speeds,
-        basis=basis,
+        basis=moving.free,
         stiffness=stiffness,
         damping=damping,
-        states=states,
+        states=_with_barred(states, of_places[:count, count:], of_rates[count:]),
     )
-    return linearisation, jnp.sum(jnp.logical_not(empty)), lax.stop_gradient(steadiness)
+    return linearisation, lax.stop_gradient(steadiness)
 
 
-def _states(moving, basis, dual, internal, units) -> tuple[StateSlopes, Float[Array, " n_s"]]:
-    """What internal states add, and how far each is off where it stands still, see `_Steadiness`."""
-    topology, still = moving.system.topology, jnp.zeros(basis.shape[1], internal.dtype)
-
-    def changes(y, y_rate, internal):
-        system = bound(moving.system, internal)
-        place = retract(topology, moving.q, basis @ y), moving.v + basis @ y_rate
-        v, acceleration, q, _ = moving.method.derivative(system, moving.t, *place, True)
-        return dual @ acceleration, internal_rates(move(configure(system, moving.t, q), v))
-
-    (_, rates), slopes = changes(still, still, internal), jax.jacfwd(changes, (0, 1, 2))(still, still, internal)
+def _states(moving, internal, units) -> tuple[StateSlopes, Float[Array, " n_s"]]:
+    """What internal states add, by all of y, and how far each is off where it stands still, see `_Steadiness`."""
+    still, degrees = jnp.zeros(moving.basis.shape[1], units.dtype), moving.degrees_of_freedom
+    if internal is None:
+        nothing = jnp.zeros((0, 0), units.dtype)
+        shaped = nothing.reshape(degrees, 0), nothing.reshape(0, len(still)), nothing.reshape(0, degrees), nothing
+        return StateSlopes(*shaped), jnp.zeros(0, units.dtype)
+    at = still, still[:degrees], internal
+    (_, rates), slopes = moving.rates(*at), jax.jacfwd(moving.rates, (0, 1, 2))(*at)
     (_, _, force), (by_coordinates, by_speeds, by_states) = slopes
     # The rate that each would have where all coordinates and states were off by one in their scales.
-    size = jax.vmap(moving.system.fastest, in_axes=1)(basis)
+    size = jax.vmap(moving.system.fastest, in_axes=1)(moving.basis)
     sensitivity = jnp.abs(by_coordinates) @ ratio(jnp.ones_like(size), size, 0.0) + jnp.abs(by_states) @ units
     felt = jnp.abs(rates) > UNFELT * sensitivity
     off = jnp.where(felt, ratio(jnp.abs(rates), sensitivity, jnp.inf), 0.0)
-    return StateSlopes(force, by_coordinates, by_speeds, by_states), off
+    return StateSlopes(force[:degrees], by_coordinates, by_speeds, by_states), off
 
 
-def _coefficients(moving, columns, moves):
-    """Stiffness and damping at the state, and (ÿ, stiffness, damping, gap of the loops) now and at later instants."""
+def _with_barred(states, stiffness, rates):
+    """Displacements that slips bar as further states; None without either.
+
+    **Arguments:** `states`: by all of y; `stiffness`: by what is barred, (d, b); `rates`: slopes of this, (b, d + b).
+    """
+    degrees, barred = stiffness.shape
+    if states.force.shape[1] + barred == 0:
+        return None
+    split = lambda matrix: jnp.split(matrix, [degrees], axis=1)
+    (by_free, by_barred), (of_free, of_barred) = split(states.by_coordinates), split(rates)
+    none = jnp.zeros((barred, degrees + len(by_free)), rates.dtype)
+    return StateSlopes(
+        force=jnp.concatenate([states.force, -stiffness], axis=1),
+        by_coordinates=jnp.concatenate([by_free, of_free]),
+        by_speeds=jnp.concatenate([states.by_speeds, none[:, :degrees]]),
+        by_states=jnp.block([[states.by_states, by_barred], [none[:, degrees:], of_barred]]),
+    )
+
+
+def _coefficients(moving, moves):
+    """The coefficients at the state, and (ÿ, coefficients, gap of the loops) now and at later instants."""
 
     def at_instant(moving):
-        acceleration, stiffness, damping = moving.coefficients()
-        reduced = (matrix[columns[:, None], columns[None, :]] for matrix in (stiffness, damping))
-        return acceleration[columns], *reduced, moving.opens() if moves else jnp.zeros((), moving.system.dtype)
+        return *moving.coefficients(), moving.opens() if moves else jnp.zeros((), moving.system.dtype)
 
     now = at_instant(moving)
     history = jax.tree.map(lambda part: part[None], lax.stop_gradient(now))
     if moves:
         still = lax.stop_gradient(moving)
-        later = instants(moving.system, still.t, still.v)
-        after = lax.map(lambda instant: at_instant(still.after(*instant)), later)
+        later = instants(moving.system, still.v)
+        after = lax.map(lambda duration: at_instant(still.after(duration)), later)
         history = jax.tree.map(lambda *parts: jnp.concatenate(parts), history, after)
     return now[1:3], history
 
 
-def _frequencies(moving, basis, symmetric, damping, may_couple):
+def _frequencies(moving, symmetric, damping, may_couple):
     """Natural frequencies, and speeds of the tree's joints in each mode, NaN where gyroscopic terms couple them."""
     system, couples, gyroscopic = moving.system, jnp.zeros((), bool), (damping - damping.T) / 2.0
     if may_couple:
@@ -300,7 +386,7 @@ def _frequencies(moving, basis, symmetric, damping, may_couple):
     if may_couple:
         matrix = state_matrix(jnp.where(couples, symmetric, apart), jnp.where(couples, gyroscopic, 0.0))
         frequencies = jnp.where(couples, gyroscopic_frequencies(matrix), frequencies)
-    return frequencies, jnp.where(couples, jnp.nan, basis @ vectors)
+    return frequencies, jnp.where(couples, jnp.nan, moving.free @ vectors)
 
 
 class _Modes(NamedTuple):
@@ -322,7 +408,7 @@ class _Modes(NamedTuple):
         return _Modes(basis @ vectors, vectors, jnp.maximum(jnp.abs(values), system.fastest(v) ** 2))
 
 
-def _steadiness(moving, state, basis, modes, history, of_states) -> _Steadiness:
+def _steadiness(moving, state, modes, history, of_states) -> _Steadiness:
     """How steady a motion is, from its `history` of coefficients and gaps, see `_coefficients`.
 
     **Arguments:** `of_states`: accelerations of the modes by internal states in their scales, whose parts may cancel.
@@ -336,10 +422,13 @@ def _steadiness(moving, state, basis, modes, history, of_states) -> _Steadiness:
     worst = jnp.argmax(jnp.max(distance, axis=1, initial=0.0))
 
     # Relative to the geometric mean of two modes' stiffnesses, and beyond rounding of the stiffest one.
-    scale = jnp.sqrt(jnp.outer(modes.square, modes.square))
+    barred = moving.basis.shape[1] - moving.degrees_of_freedom
+    vectors = block_diag(modes.vectors, jnp.eye(barred, dtype=system.dtype))
+    square = jnp.concatenate([modes.square, jnp.broadcast_to(system.fastest(moving.v) ** 2, (barred,))])
+    scale = jnp.sqrt(jnp.outer(square, square))
 
     def changes(matrices, scale):
-        seen = modes.vectors.T @ matrices @ modes.vectors
+        seen = vectors.T @ matrices @ vectors
         scale = scale + jnp.abs(seen[0])
         differences = jnp.abs(seen - seen[0])
         felt = differences > ROUNDING_ULPS * jnp.finfo(system.dtype).eps * jnp.max(scale, initial=0.0)
@@ -348,7 +437,7 @@ def _steadiness(moving, state, basis, modes, history, of_states) -> _Steadiness:
     return _Steadiness(
         missed=missed_rates(system, moving.t, state.q, state.v) if len(opens) > 1 else jnp.zeros(0, system.dtype),
         off=jnp.max(distance, initial=0.0),
-        acceleration=basis @ accelerations[worst],
+        acceleration=moving.free @ accelerations[worst],
         changes=jnp.max(jnp.stack([changes(stiffness, scale), changes(damping, jnp.sqrt(scale)), jnp.max(opens)])),
         of_states=jnp.zeros(0, system.dtype),
     )

@@ -1,0 +1,186 @@
+"""Small motions about steady motions with slips, against closed forms: a sleigh, discs that roll, Whipple's bicycle."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mechanisms import rolling_disc, sleigh, steady_spin
+from scipy import interpolate
+
+import linkax as lx
+
+G = 9.81
+
+
+def nearest(found, wanted):
+    """By how much each wanted number is missed."""
+    return np.min(np.abs(np.asarray(found)[..., :, None] - np.asarray(wanted)[..., None, :]), axis=-2)
+
+
+@jax.jit
+@jax.vmap
+def _slides(speed):
+    mechanism, _ = sleigh(jnp.array(0.2))
+    return lx.linearise(mechanism, lx.State(jnp.zeros(3), jnp.array([0.0, 1.0, 0.0]) * speed), degrees_of_freedom=2)
+
+
+@pytest.mark.slow
+def test_a_sleigh_that_slides():
+    """Its turning decays at m a v / (I + m a²), and grows backwards; to stand still is steady, too."""
+    speeds = np.array([-3.0, -1.0, 0.0, 0.5, 2.0])
+    found = _slides(speeds)
+    exact = -2.0 * 0.2 * speeds / (0.3 + 2.0 * 0.2**2)
+    assert found.eigenvalues.shape == (5, 5)  # 2 speeds, 3 displacements
+    np.testing.assert_allclose(np.sum(found.eigenvalues, axis=1), exact, atol=1e-12)
+    np.testing.assert_allclose(nearest(found.eigenvalues, exact[:, None])[:, 0], 0.0, atol=1e-12)
+    slope = jax.grad(lambda speed: jnp.min(_slides(speed[None]).eigenvalues.real))(1.0)
+    np.testing.assert_allclose(slope, -2.0 * 0.2 / (0.3 + 2.0 * 0.2**2), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_slips_that_others_imply():
+    """A second skate in line with the first one changes nothing, but for a zero."""
+    mechanism, state = sleigh(jnp.array(0.2))
+    (plate,), edges = mechanism.bodies, [*mechanism.constraints, lx.Skate("again", mechanism.bodies[0], lx.GROUND)]
+    again = lx.Mechanism([plate], mechanism.joints, constraints=edges)
+    found = lx.linearise(again, lx.State(state.q, jnp.array([0.0, 1.0, 0.0])))
+    assert found.eigenvalues.shape == (6,)
+    np.testing.assert_allclose(np.min(found.eigenvalues.real), -2.0 * 0.2 / (0.3 + 2.0 * 0.2**2), rtol=1e-12)
+
+
+def reduced(state, mass, radius):
+    """Rates of tilt, its rate, the rates about the disc's upper radius and its axis, of a thin disc that rolls.
+
+    Moments about the point that touches, in axes (along the track, up the disc, its axis) that follow the tilt.
+    """
+    tilt, fall, steer, spin = state
+    axial, across = mass * radius**2 / 2.0, mass * radius**2 / 4.0
+    inertia, up = jnp.array([across, across, axial]), jnp.array([0.0, 1.0, 0.0]) * radius
+    turns = jnp.array([fall, steer, -steer * jnp.tan(tilt)])  # of the axes
+    vertical = jnp.array([0.0, jnp.cos(tilt), -jnp.sin(tilt)])
+    omega = jnp.array([fall, steer, spin])
+
+    def moment(change):
+        velocity = jnp.cross(change, up) + jnp.cross(turns, jnp.cross(omega, up))
+        momentum = inertia * change + jnp.cross(turns, inertia * omega)
+        return momentum + jnp.cross(up, mass * (velocity + G * vertical))
+
+    still = jnp.zeros(3)
+    return jnp.concatenate([jnp.array([fall]), -jnp.linalg.solve(jax.jacfwd(moment)(still), moment(still))])
+
+
+@jax.jit
+@jax.vmap
+def _rolls(tilt, turning, spin):
+    mechanism, state = rolling_disc(tilt, turning, spin)
+    return lx.linearise(mechanism, state, degrees_of_freedom=3).eigenvalues
+
+
+@pytest.mark.slow
+def test_discs_that_roll_upright_and_in_circles():
+    """Upright λ² = (4 g / r − 12 ω²) / 5 of a uniform thin disc, unstable below ω² = g / (3 r): Routh, Advanced
+    Rigid Dynamics, art. 244; leaning as the reduced equations of motion say.
+    """
+    mass, radius, turning = 1.5, 0.4, 1.8
+    tilts, rates = np.array([0.0, 0.0, 0.35, 0.7, 0.2]), np.array([0.0, 0.0, turning, turning, 0.3])
+    critical = np.sqrt(G / (3.0 * radius))
+    spins = np.array(
+        [0.9 * critical, 1.1 * critical, *(steady_spin(*each) for each in zip(tilts[2:], rates[2:], strict=True))]
+    )
+    found = _rolls(tilts, rates, spins)
+    squares = (4.0 * G / radius - 12.0 * spins[:2] ** 2) / 5.0
+    upright = np.sqrt(squares.astype(complex))[:, None] * [1.0, -1.0]
+    np.testing.assert_allclose(nearest(found[:2], upright), 0.0, atol=1e-8)
+    for tilt, rate, spin, each in zip(tilts[2:], rates[2:], spins[2:], found[2:], strict=True):
+        state = np.array([-tilt, 0.0, rate * np.cos(tilt), spin + rate * np.sin(tilt)])
+        np.testing.assert_allclose(reduced(state, mass, radius), 0.0, atol=1e-10)
+        values = np.linalg.eigvals(jax.jacfwd(reduced)(state, mass, radius))
+        pair = values[np.argsort(np.abs(values))[2:]]
+        np.testing.assert_allclose(nearest(each, pair), 0.0, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_what_does_not_roll_steadily_is_refused():
+    tilt, turning = 0.35, 1.8
+    mechanism, state = rolling_disc(tilt, turning, 1.1 * steady_spin(tilt, turning))
+    with pytest.raises(ValueError, match="joint 'flight' accelerates"):
+        lx.linearise(mechanism, state)
+
+
+AXLE = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # of a wheel, z to the right
+
+
+def bicycle():
+    """Whipple's, with the numbers of Meijaard, Papadopoulos, Ruina and Schwab, Proc. R. Soc. A 463 (2007), table 1."""
+    rear = lx.RigidBody("rear", 2.0, inertia=[0.0603, 0.12, 0.0603])
+    front = lx.RigidBody("front", 3.0, inertia=[0.1405, 0.28, 0.1405])
+    frame = lx.RigidBody("frame", 85.0, [0.3, 0, 0.9], [[9.2, 0, -2.4], [0, 11.0, 0], [-2.4, 0, 2.8]])
+    fork = lx.RigidBody("fork", 4.0, [0.9, 0, 0.7], [[0.05892, 0, 0.00756], [0, 0.06, 0], [0.00756, 0, 0.00708]])
+    tilt = np.pi / 10.0
+    axis = np.array([-np.sin(tilt), 0.0, np.cos(tilt)])
+    head = np.array([1.1, 0.0, 0.0]) + 0.9 * axis  # any point of it
+    joints = [
+        lx.Free("pose", lx.GROUND, frame),
+        lx.Revolute("rear_axle", frame.at([0, 0, 0.3]), rear, axis="y"),
+        lx.Revolute("steer", frame.at(head), fork.at(head), axis=axis),
+        lx.Revolute("front_axle", fork.at([1.02, 0, 0.35]), front, axis="y"),
+    ]
+    rolls = [
+        lx.RollingDisc("rear_rolls", rear.at([0, 0, 0], rotation=AXLE), lx.GROUND, 0.3),
+        lx.RollingDisc("front_rolls", front.at([0, 0, 0], rotation=AXLE), lx.GROUND, 0.35),
+    ]
+    return lx.Mechanism([rear, front, frame, fork], joints, [lx.Gravity([0, 0, -G])], rolls)
+
+
+# M q̈ + v C q̇ + (g K₀ + v² K₂) q = 0 of lean and steer, as the paper gives them.
+MASS = np.array([[80.81722, 2.31941332208709], [2.31941332208709, 0.29784188199686]])
+BY_SPEED = np.array([[0.0, 33.86641391492494], [-0.85035641456978, 1.68540397397560]])
+BY_WEIGHT = np.array([[-80.95, -2.59951685249872], [-2.59951685249872, -0.80329488458618]])
+BY_SQUARE = np.array([[0.0, 76.59734589573222], [0.0, 2.65431523794604]])
+
+
+def lean_and_steer(speed):
+    stiffness, damping = G * BY_WEIGHT + speed**2 * BY_SQUARE, speed * BY_SPEED
+    lower = -np.linalg.solve(MASS, np.hstack([stiffness, damping]))
+    return np.linalg.eigvals(np.vstack([np.eye(4)[2:], lower]))
+
+
+@pytest.mark.slow
+def test_a_bicycle_that_rolls():
+    """At all speeds; where it gets stable, and falls over slowly, found by derivatives."""
+    mechanism = bicycle()
+    start = {"frame": lx.Pose([0.0, 0.0, 0.0], np.eye(3)), "steer": 0.0}
+    state = lx.assemble(mechanism, start, {"frame": lx.Velocity([1.0, 0.0, 0.0], [0.0, 0.0, 0.0]), "steer": 0.0})
+
+    def values(speed):
+        return lx.linearise(mechanism, lx.State(state.q, speed * state.v), degrees_of_freedom=3).eigenvalues
+
+    with_slopes = jax.jit(jax.vmap(lambda speed: jax.jvp(values, (speed,), (jnp.ones(()),))))
+    speeds = np.linspace(0.0, 10.0, 11)
+    found, _ = map(np.asarray, with_slopes(speeds))
+    assert found.shape == (11, 10)  # 3 speeds, 7 displacements
+    np.testing.assert_allclose(nearest(found, [lean_and_steer(speed) for speed in speeds]), 0.0, atol=1e-8)
+    known = [-14.07838969279822, -0.32286642900409, -0.77534188219585 + 4.46486771378823j]
+    np.testing.assert_allclose(nearest(found[5], known), 0.0, atol=1e-8)
+
+    def near(speeds, wanted):
+        """The wanted eigenvalue at each speed, and its slope."""
+        every = np.resize(speeds, 11)
+        pairs = zip(every, *map(np.asarray, with_slopes(every)), strict=True)
+        chosen = [
+            (each[place := np.argmin(np.abs(each - wanted(speed)))], slopes[place]) for speed, each, slopes in pairs
+        ]
+        return np.array(chosen).real[: len(speeds)].T
+
+    weave = lambda speed: max(lean_and_steer(speed), key=np.imag)
+    speed = 4.5
+    for _ in range(5):
+        (value,), (slope,) = near(np.array([speed]), weave)
+        speed -= value / slope
+    np.testing.assert_allclose(speed, 4.29238253634111, atol=1e-8)
+    # Where it falls over slowly, its eigenvalue meets those of its place, which have no derivatives: from beside it.
+    capsize = lambda speed: max(lean_and_steer(speed)[np.abs(lean_and_steer(speed).imag) < 1e-9], key=np.real)
+    beside = np.array([5.75, 5.8, 5.85, 5.9, 6.15, 6.2, 6.25, 6.3])
+    value, slope = near(beside, capsize)
+    inverse = interpolate.KroghInterpolator(np.repeat(value, 2), np.stack([beside, 1.0 / slope], axis=1).ravel())
+    np.testing.assert_allclose(inverse(0.0), 6.02426201538837, atol=1e-8)
