@@ -34,13 +34,12 @@ def _left(matrix, values):
 
 
 def _equal_another(matrix, values, vectors):
-    """Whether each eigenvalue is as close to another as rounding moves it, by ε |w|ᵀ |A| |v| / |wᵀ v|."""
-    left = _left(matrix, values)
-    moved = jnp.sum(jnp.abs(left) * (jnp.abs(matrix) @ jnp.abs(vectors)), axis=0) / jnp.abs(
-        jnp.sum(left * vectors, axis=0)
-    )
+    """Whether each eigenvalue is as close to another as rounding of the largest moves it, by ε |λ| / |wᵀ v|."""
+    along = jnp.abs(jnp.sum(_left(matrix, values) * vectors, axis=0))  # of unit vectors
     apart = jnp.abs(values[:, None] - values[None, :]) + jnp.diag(jnp.full(len(values), jnp.inf, matrix.dtype))
-    return jnp.logical_not(jnp.min(apart, axis=1) > EQUAL_ULPS * jnp.finfo(matrix.dtype).eps * moved)
+    rounding = EQUAL_ULPS * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(values))
+    # No quotient: of a double zero both sides are zero.
+    return jnp.min(apart, axis=1) * along <= rounding
 
 
 @jax.custom_jvp
@@ -125,7 +124,7 @@ class Linearisation(NamedTuple):
     rotate with the bodies.
 
     Differentiable, but for frequencies and eigenvalues that equal another one up to rounding, and their modes and
-    eigenvectors, whose derivatives are NaN.
+    eigenvectors, whose derivatives are NaN. Take one by its index: forwards, JAX's maximum spreads the NaN of others.
     """
 
     natural_frequencies: Float[Array, " d"]
