@@ -5,6 +5,8 @@ the linearised equations along each of them. A motion with v = X(q) is a relativ
 Introduction to Mechanics and Symmetry, 1999.
 """
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -76,7 +78,7 @@ class Symmetry(eqx.Module):
 
         And to each quaternion those of an angular velocity, to a `Free` joint of a velocity too, in axes of the child.
         """
-        speeds, places, start = self.constant, coordinates_by_speed(self.topology, q), 0
+        speeds, places, start = jnp.asarray(self.constant), coordinates_by_speed(self.topology, q), 0
         for columns in _ground_slides(self.topology):
             velocity = cross(self.turns[start : start + 3], places[columns] @ self.axes[columns])
             speeds, start = speeds.at[columns].add(self.axes[columns] @ velocity), start + 3
@@ -111,8 +113,8 @@ class Symmetry(eqx.Module):
             carry = of_each(lambda change: self.carry(q, change))
             return duration * rates(topology, q, self.speeds(q)), duration * carry(changes)
 
-        error = jnp.finfo(q.dtype).eps ** (2 / 3)
-        found = diffrax.diffeqsolve(
+        error = float(jnp.finfo(q.dtype).eps) ** (2 / 3)
+        found: Any = diffrax.diffeqsolve(
             diffrax.ODETerm(flow),
             diffrax.Dopri8(),
             t0=0.0,

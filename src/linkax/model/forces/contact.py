@@ -91,7 +91,8 @@ class Contact(SurfaceContact):
     Spheres and capsules meet each other, and planes; a capsule on a plane touches with the spheres at both of its ends.
     The force acts in the middle of the penetration. Where two capsules lie along each other, their nearest points jump
     from end to end as they tilt: put spheres on one of them instead. Steps end where contact begins and ends, and
-    pass no thin obstacle, see `linkax.Impact`. What the law costs, and when to take `linkax.Impact` or another simulator instead, see `linkax.ContactLaw`.
+    pass no thin obstacle, see `linkax.Impact`. What the law costs, and when to take `linkax.Impact` or another
+    simulator instead, see `linkax.ContactLaw`.
 
     `Solution.force` has the normal force [N], of both ends in sum.
 

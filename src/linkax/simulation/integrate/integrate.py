@@ -116,7 +116,7 @@ def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     saved = saveat.subs.ts if run.has_discrete_adjoint else None
     solve = integrate if run.has_discrete_adjoint else solve_by_diffrax
     integrated, _ = solve(InitialValueProblem(problem, y0, t0, t1, saved), integrator, False)
-    rests = impacts_of(problem.system) and at_rest(problem.system, problem.sides(integrated.y_end))
+    rests = impacts_of(problem.system) and at_rest(problem.system, jnp.asarray(problem.sides(integrated.y_end)))
     result = _result(integrated.result, initial, in_order, control.is_adaptive, rests)
     integrated = integrated._replace(result=result)
     return _without_derivatives(integrated, event, inputs)
