@@ -9,6 +9,7 @@ import pytest
 from mechanisms import pendulum
 
 import linkax as lx
+from linkax.simulation.read import work
 
 THROWS = 200
 RADIUS = 0.05  # of a ball and of a post
@@ -102,3 +103,20 @@ def test_the_unit_of_a_switch_does_not_matter():
     assert np.all(well)
     np.testing.assert_allclose(angle, np.full(5, angle[2]), rtol=1e-9)
     assert np.max(steps) < 30.0 * angle[2] / (2.0 * np.pi)
+
+
+def test_work_between_saved_times_is_seen(monkeypatch):
+    """A stiff stop takes all energy that is lost, in contacts that are shorter than the time between saved ones."""
+    ball = lx.RigidBody("ball", mass=1.0, inertia=[0.01, 0.01, 0.01])
+    slide = lx.Prismatic("slide", lx.GROUND, ball, axis="z")
+    law = lx.ContactLaw(stiffness=1e8, restitution=0.5, impact_speed=5.0)
+    stop = lx.Contact(lx.Sphere(ball, 0.1), lx.Plane(lx.GROUND), law, name="stop")
+    mechanism = lx.Mechanism([ball], [slide], [lx.Gravity([0.0, 0.0, -10.0]), stop])
+    simulated = lambda: lx.simulate(mechanism, lx.State(jnp.array([1.1]), jnp.zeros(1)), t1=1.0)
+    run = simulated()
+    energy = run.energy()
+    np.testing.assert_allclose(run.work()["stop"][-1], energy[-1] - energy[0], rtol=1e-6)
+    np.testing.assert_allclose(run.unaccounted_energy(), 0.0, atol=1e-5)
+    monkeypatch.setattr(work, "MOST_PARTS", 0)
+    with pytest.warns(lx.AccuracyWarning, match="work is known to 8.7 J only, .* save more of them"):
+        simulated().work()

@@ -231,6 +231,9 @@ class Solution(Kinematics):
         These are force elements beyond the fall of their potential energy (dampers, torques, forces of your own), by
         `Mechanism.force_names`, impacts, and constraints that change with time (drives, winches). Between saved times
         the motion is interpolated, with an error of work in proportion to the sixth power of the time between them.
+        Where energy is not accounted for that way, as in a contact that is shorter, the motion of a single run is run
+        again between the two saved times, with more of them; what is still not accounted for is told by an
+        `AccuracyWarning`. Of a batch, and inside of JAX transformations, see `unaccounted_energy`.
         """
         return kept(self, "work", lambda: work(self))
 
@@ -255,7 +258,8 @@ class Solution(Kinematics):
     def unaccounted_energy(self) -> Float[Array, "*batch n_t"]:
         """Change of `energy` since the first saved time, less all `work` [J]: an error.
 
-        It is that of the integration, and of `work` where saved times are far apart or forces jump between them.
+        It is that of the integration, and of `work`; of batches that also where saved times are far apart or forces
+        jump between them.
         """
         change = self.energy()
         return change - change[..., :1] - sum(self.work().values(), jnp.zeros_like(change))
