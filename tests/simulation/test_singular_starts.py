@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from known_answers import mechanism_of, reference, rise_of_sarrus
-from mechanisms import raised, raised_exactly, sarrus
+from mechanisms import crank_slider, pendulum, raised, raised_exactly, sarrus
 from scipy.optimize import brentq
 from scipy.special import ellipeinc
 
@@ -153,6 +153,69 @@ def test_a_start_at_rest_that_is_not_unique_is_found_out():
     # Without forces it stays, and that is unique.
     at_rest = lx.simulate(mechanism_of("crank-slider", "SC2"), state, t1=0.5)
     assert np.ptp(at_rest.q, axis=0) == pytest.approx(0.0, abs=1e-15)
+
+
+def _motion(numbers, t):
+    return numbers[0] + numbers[1] * t + numbers[2] * t**2
+
+
+def started(mechanism_with, place, speed, acceleration, joint, guess):
+    """The speeds that a drive makes, over its own, and how a run from there ends."""
+    law = jax.tree_util.Partial(_motion, jnp.array([place, speed, acceleration / 2.0]))
+    mechanism = mechanism_with(constraints=[lx.Drive("motor", joint, law)])
+    state = lx.assemble(mechanism, guess=guess)
+    found = lx.simulate(mechanism, state, t1=0.01, throw=False)
+    if found.result == lx.RESULTS.successful:
+        np.testing.assert_allclose(found.joint(joint)[-1], law(0.01), atol=1e-12)
+    return state.v / speed, found.result
+
+
+# Down to where squares vanish, and around what rounding leaves of speeds next to accelerations.
+SLOW = np.array([1.0, -1e-2, 1e-4, -1e-5, 1e-6, 1e-7, -5e-8, 1e-8, 1e-12, -1e-20, 1e-100, 1e-155, 1e-200, -1e-300])
+ACCELERATIONS = 20.0, -6.0, 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mechanism_with", "joint", "guess"),
+    [(crank_slider, "bearing", {"bearing": 0.7, "crank_pin": -1.2, "guide": 1.8}), (pendulum, "hinge", None)],
+)
+def test_drives_that_start_slowly(mechanism_with, joint, guess):
+    """As sin(ωt − π/2) does, whose speed at zero is rounding: a linkage moves at any speed as it does at any other."""
+    starts = [(speed, acceleration) for acceleration in ACCELERATIONS for speed in SLOW]
+    found = [started(mechanism_with, 0.7, *start, joint, guess) for start in starts]
+    assert all(result == lx.RESULTS.successful for _, result in found)
+    rates = np.array([rates for rates, _ in found])
+    np.testing.assert_allclose(rates, np.broadcast_to(rates[0], rates.shape), rtol=1e-12)
+    # At rest, too.
+    assert started(mechanism_with, 0.7, 0.0, 20.0, joint, guess)[1] == lx.RESULTS.successful
+
+
+def test_a_drive_may_start_as_sines_do():
+    bent = {"bearing": 0.7, "crank_pin": -1.2, "guide": 1.8}
+    for speed in (1.2e-16, 1e-5):
+        assert started(crank_slider, 0.7, speed, 20.0, "bearing", bent)[1] == lx.RESULTS.successful
+
+
+@pytest.mark.slow
+def test_joints_that_start_slowly():
+    mechanism = crank_slider()
+    start = lambda speed: lx.assemble(mechanism, {"bearing": 0.7}, {"bearing": speed}, guess={"crank_pin": -1.2})
+    rates = np.array([start(speed).v / speed for speed in SLOW])
+    np.testing.assert_allclose(rates, np.broadcast_to(rates[0], rates.shape), rtol=1e-12)
+    for speed in SLOW:
+        assert lx.simulate(mechanism, start(speed), t1=0.01).result == lx.RESULTS.successful
+
+
+@pytest.mark.slow
+def test_a_slow_drive_in_a_singular_configuration_is_found_out():
+    """Cranks of equal lengths upright: the slider, driven from rest, may move with them, or not."""
+    upright = {"bearing": np.pi / 2, "crank_pin": -np.pi, "guide": 0.0}
+    equal = lambda constraints: crank_slider(rod=1.0, constraints=constraints)
+    for speed in SLOW:
+        _, result = started(equal, 0.0, speed, 20.0, "guide", upright)
+        expected = lx.RESULTS.successful if abs(speed) > 5e-7 else lx.RESULTS.not_unique
+        assert result == expected
 
 
 @pytest.mark.slow

@@ -79,9 +79,9 @@ def constraint_gamma(motion: Motion, pace: ScalarLike) -> Float[Array, " k"]:
     return jnp.concatenate(found) / motion.system.constraint_scales
 
 
-def drive_gamma(motion: Motion, pace: ScalarLike) -> Float[Array, " k"]:
+def drive_gamma(motion: Motion) -> Float[Array, " k"]:
     """The part of it that passing time causes."""
-    of = lambda constraint: _acceleration(motion, constraint, 0.0) - _acceleration(motion, constraint, pace)
+    of = lambda constraint: _acceleration(motion, constraint, 0.0) - _acceleration(motion, constraint, 1.0)
     return _of_driven(motion.system, of)
 
 

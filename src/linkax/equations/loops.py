@@ -35,7 +35,7 @@ from linkax.equations.loop_rows import (
 from linkax.equations.motion import Motion
 from linkax.linalg.static_sparse import StaticSparse
 from linkax.spatial.vectors import largest
-from linkax.xla.arrays import Array, ScalarLike
+from linkax.xla.arrays import Array
 from linkax.xla.tracing import jit_inline
 
 
@@ -82,9 +82,9 @@ def rate(configuration: Configuration) -> Float[Array, " m"]:
     return _last_rows(configuration.system, lambda: constraint_rate(configuration))
 
 
-def drive_acceleration(motion: Motion, pace: ScalarLike = 1.0) -> Float[Array, " m"]:
-    """The part of γ that drives cause, where time passes at a `pace`: relative to speeds that are not those of time."""
-    return _last_rows(motion.system, lambda: drive_gamma(motion, pace))
+def drive_acceleration(motion: Motion) -> Float[Array, " m"]:
+    """The part of γ that drives cause."""
+    return _last_rows(motion.system, lambda: drive_gamma(motion))
 
 
 def _last_rows(system, found):

@@ -20,11 +20,12 @@ from linkax.equations.system import System
 from linkax.linalg.constrained_solve import constrained_solve
 from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.linalg.saddle_inverse import SaddleInverse, invert_apart
-from linkax.spatial.vectors import length
+from linkax.spatial.vectors import largest, length
 from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import positive_or_one, ratio
 
 OPENING = 1e-6  # growth of a row of R per unit of motion that counts as none
+SEEN_ULPS = 100.0  # of what drives ask for, over the distance d: what is less is rounding
 
 
 class ConstraintSplit(eqx.Module):
@@ -66,7 +67,7 @@ class ConstraintSplit(eqx.Module):
 
         **Arguments:** `scale`: a factor of the speeds v, whose square is one of γ.
         """
-        gamma, scales = self._bias(v) + self._driven(v, scale), self.configuration.system.scales
+        gamma, scales = self._bias(v) + self.driven(v, scale), self.configuration.system.scales
         # With derivatives, which the split has none of; J a is the same in any metric.
         metric, still = jnp.diag(scales**-2), jnp.zeros_like(v)
         return (
@@ -74,8 +75,21 @@ class ConstraintSplit(eqx.Module):
             - self.jacobian @ constrained_solve(self.inverse, metric, self.jacobian, still, gamma, refinements=0)[0]
         )
 
-    def _driven(self, v, scale):
-        return drive_acceleration(move(self.configuration, v), 1.0 / scale)
+    def driven(self, v: Float[Array, " n_v"], scale: ScalarLike = 1.0) -> Float[Array, " m"]:
+        """The part of γ that drives cause, likewise, (m,)."""
+        # Not over the square, which a small scale does not have.
+        return drive_acceleration(move(self.configuration, scale * v)) / scale / scale
+
+    def seen(self, off: Float[Array, " m"], driven: Float[Array, " m"]) -> Float[Array, " m"]:
+        """What is off a branch, (m,), but for rounding of what drives ask for, which slow speeds are small next to."""
+        return jnp.where(jnp.abs(off) > self._rounding(driven), off, 0.0)
+
+    def slowest(self) -> Float[Array, ""]:
+        """The largest speed up to which rounding of what drives ask for hides whether speeds are on a branch."""
+        return jnp.sqrt(self._rounding(self.driven(jnp.zeros_like(self.configuration.system.scales))))
+
+    def _rounding(self, driven):
+        return SEEN_ULPS * jnp.finfo(driven.dtype).eps * largest(driven) / self.inverse.distance
 
     def along(
         self, v: Float[Array, " n_v"], from_rest: bool | Bool[Array, ""]
@@ -104,8 +118,8 @@ class ConstraintSplit(eqx.Module):
             return jnp.sum(jnp.abs(jnp.diagonal(pivoted_qr(block).r)) > OPENING)
 
         opened = jnp.stack([opening(*island) for island in self.configuration.system.structure.islands])
-        driven = self._driven(jnp.where(from_rest, 0.0, direction), jnp.where(from_rest, jnp.sqrt(scale), scale))
-        return outside[:, 0] + self._outside(driven), self.inverse.rank + opened
+        driven = self.driven(jnp.where(from_rest, 0.0, direction), jnp.where(from_rest, jnp.sqrt(scale), scale))
+        return self.seen(outside[:, 0] + self._outside(driven), driven), self.inverse.rank + opened
 
 
 class AtRest(NamedTuple):

@@ -88,9 +88,8 @@ class _Asked(eqx.Module):
 
     def off_branch(self, v: Float[Array, " n_v"]) -> Float[Array, ""]:
         """How far speeds are from a branch, over the square of the largest."""
-        fastest = self.system.fastest(v)
-        off = largest(self.split.off_branch(v, self.scale))
-        return ratio(off, fastest**2, 0.0)
+        off = self.split.seen(self.split.off_branch(v, self.scale), self.split.driven(v, self.scale))
+        return ratio(largest(off), self.system.fastest(v) ** 2, 0.0)
 
 
 @eqx.filter_custom_jvp
@@ -120,7 +119,7 @@ def _asked(configuration, held):
     system = configuration.system
     split = ConstraintSplit.of(configuration, rank_tolerance(system.dtype))
     right = jnp.concatenate([rate(configuration), held.flat()])
-    scale = lax.stop_gradient(positive_or_one(largest(right)))
+    scale = lax.stop_gradient(positive_or_one(jnp.maximum(largest(right), split.slowest())))
     of_held = lambda v: held.speeds(move(configuration, v))
     rows = jnp.concatenate([split.jacobian, held.slopes(of_held, system.topology, system.dtype)])
     return _Asked(split, rows, right / scale, scale)

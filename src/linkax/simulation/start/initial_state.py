@@ -160,7 +160,8 @@ def _at_start(method, system, t, q, v) -> _AtStart:
         zero, false, true = jnp.zeros((), q.dtype), jnp.zeros((), bool), jnp.ones((), bool)
         return _AtStart(mass, acceleration, definiteness, rank, rank, zero, v, false, true)
     gap = gaps(split.configuration).in_scales(system).widest()
-    at_rest = system.fastest(v) ** 2 <= jnp.finfo(system.dtype).eps * system.fastest(acceleration)
+    slowest = jnp.maximum(jnp.finfo(system.dtype).eps * system.fastest(acceleration), split.slowest() ** 2)
+    at_rest = system.fastest(v) ** 2 <= slowest
     direction = jnp.where(at_rest, acceleration, v)
     off, beside = split.along(direction, at_rest)
     # Rows that are not quite dependent contradict each other by as much.
