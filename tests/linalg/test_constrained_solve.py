@@ -142,6 +142,20 @@ def test_the_blocks_of_the_inverse(case, metric):
     assert np.linalg.matrix_rank(inverse.tangent, tol=1e-8 * scale) == len(mass) - RANKS[case]
 
 
+@pytest.mark.parametrize("heavy", [1.0, 1e8])
+def test_rows_hold_massless_speeds_whatever_is_next_to_zero_in_them(heavy):
+    """Rows that move a massless speed alone, but for entries of rounding, or larger ones, at any ratio of masses."""
+    mass, force, rate = np.diag([heavy, 1.0, 0.0]), np.array([heavy, 0.5, 0.3]), np.array([0.7])
+    for off in (0.0, 1e-17, 1e-15, 1e-12, 1e-10, 1e-9, 1e-8, 1e-6, 1e-3):
+        row = np.array([[off, -2.0 * off, 0.4]])
+        kkt = np.block([[mass, -row.T], [row, np.zeros((1, 1))]])
+        expected = np.linalg.solve(kkt, np.concatenate([force, rate]))
+        inverse = invert(jnp.asarray(mass), jnp.asarray(row), jnp.ones(3), TOLERANCE)
+        assert inverse.definiteness > 1e-8
+        found = np.concatenate(constrained_solve(inverse, mass, row, force, rate))
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
 def test_distance_is_the_ratio_of_the_diagonal_of_r():
     _, jacobian, _, _ = matrices(problem("redundant"), THETA)
     diagonal = np.abs(np.diagonal(scipy.linalg.qr(np.asarray(jacobian).T, pivoting=True)[1]))[:3]

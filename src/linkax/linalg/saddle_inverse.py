@@ -120,8 +120,9 @@ def _metric(weight, jacobian, scales, tolerance):
     weight, size = weight * scales[:, None] * scales[None, :], length(jacobian)
     # A row of rounding alone would add as much as any other, and is left out.
     square = jnp.where(size > tolerance * jnp.maximum(jnp.max(size, initial=0.0), 1.0), size**4, 0.0)
-    moved = jnp.sum(jacobian**2 * jnp.diagonal(weight), axis=1)
-    # A row that moves massless bodies alone takes the largest mass that there is.
+    # A row that moves massless bodies alone, but for rounding, takes the largest mass that there is.
+    moves = jnp.where(jnp.abs(jacobian) > tolerance * size[:, None], jacobian, 0.0)
+    moved = jnp.sum(moves**2 * jnp.diagonal(weight), axis=1)
     moved = jnp.where(moved > 0.0, moved, jnp.max(jnp.diagonal(weight), initial=0.0) * size**2)
     added = ratio(moved, square, 0.0)
     return weight + (jacobian.T * added) @ jacobian, added
