@@ -171,7 +171,6 @@ def test_axes_are_normalised_and_static_unless_traced():
 
 
 RELATED = {
-    "coupling with a cut joint": (lx.Coupling("gears", {"far": 1.0}), ["'gears'", "'far'", "is cut", "cut=True"]),
     "drive of a ball": (lx.Drive("motor", "ball", jnp.sin), ["'motor'", "'ball'", "3 speeds"]),
     "drive of a ball at constant speed": (lx.Drive("motor", "ball", speed=1.0), ["'motor'", "'ball'", "3 speeds"]),
     "drive of a turning ball": (lx.Drive("motor", ("ball", 1), jnp.sin), ["'motor'", "'ball'", "quaternion"]),
@@ -179,7 +178,6 @@ RELATED = {
         lx.PolynomialCoupling("curve", "pin", {("ball", 1): 2.0}, [0.0, 1.0, 2.0]),
         ["'curve'", "'ball'", "quaternion", "another"],
     ),
-    "curve of a cut joint": (lx.PolynomialCoupling("curve", "far", "pin", [0.0, 1.0]), ["'curve'", "'far'", "cut"]),
     "spring on a ball": (lx.JointSpring(("ball", 0), 1.0), ["'ball'", "JointSpring", "quaternion", "another"]),
     "servo on a ball": (lx.AffineActuator({("ball", 2): 0.5}), ["'ball'", "AffineActuator", "quaternion", "another"]),
     "spring to a body that is not there": (lx.Spring(LINK, body("absent"), 1.0), ["Spring", "'absent'", "add"]),

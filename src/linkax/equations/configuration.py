@@ -125,13 +125,12 @@ class Configuration(AbstractPoses):
         return jax.vmap(kind.measure)(compose(to_parent, self.child_axes[cut]), rotate(to_parent, self.separation[cut]))
 
     def joint_displacement(self, term: Term, origin: Number) -> Float[Array, ""]:
-        """A joint's coordinate less an origin [rad or m]; angles of a cut joint in [−π, π)."""
+        """A joint's coordinate less an origin [rad or m]."""
         index, topology = term.index or 0, self.system.topology
         if term.joint in topology.speeds:
             return coordinates_by_speed(topology, self.q)[topology.column(term)] - origin
         kind = topology.joint_types[topology.joints.index(term.joint)]
-        displacement = self.joint_coordinates(term.joint)[index + kind.has_quaternion] - origin
-        return wrapped(displacement, kind.speed_units[index] == "rad")
+        return self.joint_coordinates(term.joint)[index + kind.has_quaternion] - origin
 
     def _cut(self, names):
         """Type, axes on the parents, and indices of cut joints of one type."""

@@ -12,8 +12,10 @@ import numpy as np
 from linkax.model.beams import MASS_PLACES, Beam, BeamElasticity, FrameOnBeam
 from linkax.model.bodies import Frame, RigidBody
 from linkax.model.constraints.constraint import AbstractConstraint
+from linkax.model.elements import is_own
 from linkax.model.forces.force import AbstractForce
 from linkax.model.forces.joint_forces import JointInertia
+from linkax.model.functions import Law
 from linkax.model.joints.bending import BeamSegment, OnBeam, SleevePart, Sliding
 from linkax.model.joints.fixed import Fixed
 from linkax.model.joints.joint import AbstractJoint, JointKind
@@ -69,16 +71,28 @@ def discretise_beams(
     )
 
 
-def with_inertia(parts: Parts) -> set[str]:
-    """Name the joints that have inertia along them."""
-    return {name for force in parts.forces if isinstance(force, JointInertia) for name in force.joints}
+def counted(parts: Parts) -> set[str]:
+    """Name the joints that need coordinates of their own, which count turns.
+
+    Those with inertia along them, those that constraints relate, and those whose angles forces read, or may read by
+    functions of their own.
+    """
+    units = {joint.name: joint.speed_units for joint in parts.joints}
+    is_law = lambda node: isinstance(node, Law)
+    may_read = lambda force: (
+        force.needs_coordinate or is_own(force) or any(map(is_law, jax.tree.leaves(force, is_leaf=is_law)))
+    )
+    angles = [along for force in parts.forces if may_read(force) for along in force.terms]
+    turning = {along.joint for along in angles if units[along.joint][along.index or 0] == "rad"}
+    inertial = {name for force in parts.forces if isinstance(force, JointInertia) for name in force.joints}
+    return turning | inertial | {name for constraint in parts.constraints for name in constraint.joints}
 
 
 def to_split(parts: Parts, cuts: Iterable[AbstractJoint]) -> list[AbstractJoint]:
-    """Find the cut joints that belong into the tree: those with a motion of their own, and those with inertia."""
-    needs_speed = with_inertia(parts)
+    """Find the cut joints that belong into the tree: those with a motion, or with need of coordinates, of their own."""
+    needed = counted(parts)
     moves_its_own_way = lambda joint: isinstance(joint.kind, JointKind) and not isinstance(joint, OnBeam)
-    return [joint for joint in cuts if moves_its_own_way(joint) or joint.name in needs_speed]
+    return [joint for joint in cuts if moves_its_own_way(joint) or joint.name in needed]
 
 
 def split_cuts(parts: Parts, cuts: Iterable[AbstractJoint]) -> Parts:

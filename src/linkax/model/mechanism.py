@@ -13,7 +13,14 @@ from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
 from linkax.model.code import OwnClasses
 from linkax.model.constraints.constraint import AbstractConstraint, CoordinateConstraint
 from linkax.model.description import described
-from linkax.model.discretisation import Parts, discretise_beams, split_cuts, to_split, tree_joints_first, with_inertia
+from linkax.model.discretisation import (
+    Parts,
+    counted,
+    discretise_beams,
+    split_cuts,
+    to_split,
+    tree_joints_first,
+)
 from linkax.model.elements import is_own
 from linkax.model.forces.force import AbstractForce, given_name
 from linkax.model.forces.internal_states import checked_states
@@ -35,9 +42,10 @@ class Mechanism(eqx.Module):
     """Bodies connected by joints, with the constraints and forces on them.
 
     The spanning tree and the cut joints are found here, whatever the order of the joints: joints first that a
-    constraint relates, that have inertia or that a force acts along, then breadth first from ground.
-    `print(mechanism)` shows all in tables, `print(mechanism.topology.describe())` the tree; `cut=True` cuts a joint.
-    Bodies and joints are kept in the order of the tree.
+    constraint relates, that have inertia, whose angle a force reads or that it acts along, then breadth first from
+    ground. A joint to cut of which a coordinate is needed gets a massless body behind it, which closes the loop in its
+    place. `print(mechanism)` shows all in tables, `print(mechanism.topology.describe())` the tree; `cut=True` cuts a
+    joint. Bodies and joints are kept in the order of the tree.
 
     A beam becomes sections, bodies with names such as "boom[2.5]" (counted in elements from the base), and a
     massless body at each place that something attaches to. `beams` holds the beams as given.
@@ -194,10 +202,9 @@ def _check_names(parts: Parts) -> dict[str, RigidBody]:
 
 
 def _spanning_tree(bodies: list[str], parts: Parts) -> SpanningTree:
-    """Find the tree, with joints in it that a constraint relates, and where possible those that a force acts along."""
-    related = {name for constraint in parts.constraints for name in constraint.joints}
+    """Find the tree, where possible with joints in it that need coordinates, then those that a force acts along."""
     acted_on = {name for force in parts.forces for name in force.joints}
-    first = [*tree_joints_first(parts.joints), related, with_inertia(parts), acted_on]
+    first = [*tree_joints_first(parts.joints), counted(parts), acted_on]
     tree = spanning_tree(bodies, parts.joints, first)
     for joint in tree.cuts:
         if isinstance(joint, OnBeam):
@@ -205,12 +212,6 @@ def _spanning_tree(bodies: list[str], parts: Parts) -> SpanningTree:
                 f"joint {joint.name!r} slides along a beam and closes a loop; put a massless body on it, and close "
                 "the loop by another joint on that body"
             )
-    for name in related & {joint.name for joint in tree.cuts}:
-        of_joint = ", ".join(repr(c.name) for c in parts.constraints if name in c.joints)
-        raise ValueError(
-            f"constraint {of_joint} relates joint {name!r}, which is cut, and whose angle therefore does not count "
-            "turns; remove cut=True, or relate fewer joints of this loop"
-        )
     return tree
 
 

@@ -28,8 +28,8 @@ class AffineActuator(AbstractForce):
     - a velocity servo the gain D, and the bias (0, 0, −D);
     - a spring with a damper along a fixed tendon the gain 0, and the bias (k × rest length, −k, −d).
 
-    `Solution.force` reads F. It has no potential energy, even as a spring: all of its work is in `Solution.work`. At a
-    cut joint the angle in l is taken in [−π, π).
+    `Solution.force` reads F. It has no potential energy, even as a spring: all of its work is in `Solution.work`.
+    Angles in l count turns, see `linkax.JointSpring`.
 
     **Arguments:**
 

@@ -30,7 +30,7 @@ class PIDController(AlongJoint):
     - `filter_time`: τ [s].
     - `name`: see `linkax.AbstractForce`.
 
-    At a cut joint e is taken in [−π, π), see `linkax.JointSpring`.
+    An angle counts turns, see `linkax.JointSpring`.
 
     **Raises:** `ValueError` for a filter time that is not positive.
     """

@@ -61,8 +61,8 @@ class JointTorque(AlongJoint):
 class JointSpring(AlongJoint):
     """A linear spring along a joint: −stiffness × (coordinate − free).
 
-    At a cut joint (where all joints of a loop have springs, say) the angle from `free` is taken in (−π, π]: the
-    spring forgets whole turns.
+    Its angle counts turns. Where its joint closes a loop, a massless body is put between the joint and its child for
+    that.
 
     **Arguments:** `joint`: a name, or (name, index); `stiffness` [N m/rad or N/m]; `free`: the
     coordinate where it is unstrained [rad or m]; `name`, see `linkax.AbstractForce`.

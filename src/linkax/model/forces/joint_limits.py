@@ -19,7 +19,7 @@ from linkax.xla.arrays import Scalar
 class JointRange(eqx.Module):
     """The range of a joint's coordinate [rad or m]: from `lower`, up to `upper`, of which one may be None.
 
-    At a cut joint an angle is taken within half a turn of the middle of the range, or of its only end.
+    An angle counts turns, see `linkax.JointSpring`.
     """
 
     joint: Term = eqx.field(static=True)
