@@ -108,6 +108,8 @@ class Configuration(AbstractPoses):
         none = Load.none(self.system)
         if body == GROUND_INDEX:
             return none
+        # A user's own function may have computed in double precision.
+        force, moment = (jnp.asarray(part, self.system.dtype) for part in (force, moment))
         about_mass = moment + cross(arm - self.center_of_mass()[body], force)
         return none._replace(force=none.force.at[body].set(force), moment=none.moment.at[body].set(about_mass))
 

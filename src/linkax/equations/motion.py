@@ -98,6 +98,7 @@ class Motion(eqx.Module):
     def joint_load(self, term: Term, force: Number) -> Load:
         """Make the load of a torque [N m], or a force [N] on a slide, on the child along one speed of a joint."""
         topology, configuration, none = self.system.topology, self.configuration, Load.none(self.system)
+        force = jnp.asarray(force, self.system.dtype)
         if term.joint in topology.speeds:
             return none._replace(joint_force=none.joint_force.at[topology.column(term)].set(force))
         joint = topology.joint_index(term.joint)

@@ -113,8 +113,10 @@ class AbstractConstraint(AbstractElement):
         return self._checked("slip", self.slip, self.slip_units, t, moving)
 
     def _checked(self, what, function, units, *arguments):
+        _, attached = arguments
+        dtype = jnp.result_type(*jax.tree.leaves(attached))
         if not units:
-            return jnp.zeros(0)
+            return jnp.zeros(0, dtype)
         try:
             found = jnp.asarray(function(*arguments))
         except MISTAKES as error:
@@ -125,7 +127,7 @@ class AbstractConstraint(AbstractElement):
                 f"{self.display_name}: its {what} has shape {found.shape}, and units {units} are {count}; give one "
                 "unit for each of its numbers"
             )
-        return found.reshape(count)
+        return found.reshape(count).astype(dtype)
 
     def check_residual(self, coordinates: Mapping[str, int]) -> None:
         """Evaluate residual and slip for their shapes, and for whether they depend on time.

@@ -168,7 +168,7 @@ class AbstractForce(AbstractElement):
                     f"{self.display_name}: {name} of its load has shape {shape} and type {dtype}, not {right.shape} "
                     f"and {right.dtype}; {GIVE_LOAD}"
                 )
-        return found
+        return jax.tree.map(lambda part, right: jnp.asarray(part, right.dtype), found, whole)
 
     def state_rates(self, t: Time, motion: Motion, on: Any = None) -> Float[jax.Array, " n"]:
         """Compute the rates of all internal states and check them; none for an element without."""

@@ -257,7 +257,7 @@ class Transform(RelativeMotion):
         joint = object.__new__(self.of_type)
         for name, entry in (*self.static, *jax.tree.unflatten(self.structure, leaves).items()):
             object.__setattr__(joint, name, entry)
-        rotation, position = joint.transform(coordinates)
+        rotation, position = (jnp.asarray(part, coordinates.dtype) for part in joint.transform(coordinates))
         found = jnp.eye(4, dtype=coordinates.dtype)
         return found.at[:3, :3].set(rotation).at[:3, 3].set(position)
 
