@@ -104,6 +104,21 @@ def test_values_beyond_a_turning_point(linkage):
     np.testing.assert_allclose(rocker_angles(crank), np.linspace(1.5, 2.4, 12), atol=1e-13)
 
 
+def test_values_next_to_a_turning_point(linkage):
+    """Where crank and coupler are in line, the crank is off it by √(c δ) for a rocker that is off by δ."""
+    a, b, c, d = LENGTHS
+    end = np.pi - np.arccos((d**2 + c**2 - (b - a) ** 2) / (2.0 * d * c))
+    for way in ([1e-1, 1e-3, 1e-5, 1e-6], [1e-6, 1e-6, 1e-3, 1e-5], [1e-1, 1e-4, 1e-4, 1e-1]):
+        found = lx.trace(*linkage, {"D": end - np.array(way)})
+        crank = np.asarray(found.joint("A"))
+        np.testing.assert_allclose(rocker_angles(crank), end - np.array(way), rtol=0.0, atol=1e-13)
+        slope = jax.vmap(jax.grad(lambda crank: rocker_angle(LENGTHS, crank)))(crank)
+        np.testing.assert_allclose(found.joint_speed("A") * slope, 1.0, rtol=1e-8)
+        assert np.all(np.asarray(found.joint_speed("A")) < 0.0)  # on the same side of it
+    with pytest.raises(lx.TraceError, match=r"position 3 of 4"):
+        lx.trace(*linkage, {"D": end - np.array([1e-1, 1e-2, 1e-6, -1e-6])})
+
+
 def test_arc_length_through_turning_points(linkage):
     """The crank goes around, the rocker to both ends and back; speeds have length one."""
     s = np.linspace(0.1, 12.0, 240)

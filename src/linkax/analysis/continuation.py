@@ -32,11 +32,10 @@ MOST_CORRECTIONS = 5
 CONVERGED = 1e-8  # correction after which the next one is rounding [rad, lengths of the mechanism]
 FAITHFUL = 0.1  # largest correction of a step, relative to it, with which it is on the same branch
 ARC_CORRECTIONS = 3
-ANYHOW = 10.0 * CONVERGED  # correction that leads to no other branch
+ANYHOW = 10.0 * CONVERGED  # correction that leads to no other branch, and the shortest step
 OF_VALUES = 1e-2  # weight of values beside that of loops
 MOVES = 1e-6  # rate of rows, relative to that of coordinates, up to which it is none
 PROBE = 1e-4  # how far beside its start a way has the rank that it has elsewhere [rad, lengths of the mechanism]
-SHORTEST = 2.0**-10  # of the way from one position to the next
 
 
 class Place(NamedTuple):
@@ -253,25 +252,31 @@ class Way(eqx.Module):
 
         def unfinished(carry):
             *_, u, fraction = carry
-            return (u < 1.0) & (fraction >= SHORTEST)
+            return (u < 1.0) & (fraction > 0.0)
 
         def advance(carry):
-            q, before, u, fraction = carry
+            place, before, u, fraction = carry
             to = jnp.where(u + 1.01 * fraction >= 1.0, 1.0, u + fraction)
             h = (to - u) * piece.h
-            place = self.place(q, piece.at(u), before)
-            there, reached = self.corrected(place, h, piece.at(to).values, to == 1.0)
-            longer = jnp.where(reached, jnp.minimum(2.0 * fraction, 1.0), 0.5 * fraction)
+            q, reached = self.corrected(place, h, piece.at(to).values, to == 1.0)
             # What does not move has no direction.
             moves = self.system.fastest(place.v) > 0.0
             came = jax.tree.map(lambda new, old: jnp.where(moves, new, old), place.before(h), before)
+            there, change = self.place(q, piece.at(to), came), place.ahead(h)
+            # From another branch, next to where both meet, the way back does not lead to where it came from.
+            allowed = FAITHFUL * self.system.fastest(change) + ANYHOW
+            reached = reached & (self.system.fastest(change + there.ahead(-h)) <= allowed)
+            # Next to where it turns back, steps get as short as the rest of the way.
+            shorter = jnp.where(self.system.fastest(change) > ANYHOW, 0.5 * fraction, 0.0)
+            fraction = jnp.where(reached, jnp.minimum(2.0 * fraction, 1.0), shorter)
             moved = there, came, to
-            q, before, u = jax.tree.map(lambda new, old: jnp.where(reached, new, old), moved, (q, before, u))
-            return q, before, u, longer
+            place, before, u = jax.tree.map(lambda new, old: jnp.where(reached, new, old), moved, (place, before, u))
+            return place, before, u, fraction
 
-        begin = jnp.where(going, 0.0, 1.0).astype(q.dtype)
-        q, before, _, fraction = lax.while_loop(unfinished, advance, (q, before, begin, jnp.ones_like(begin)))
-        return q, before, going & (fraction >= SHORTEST)
+        u = jnp.where(going, 0.0, 1.0).astype(q.dtype)
+        begin = self.place(q, piece.at(u), before), before, u, jnp.ones_like(u)
+        place, before, _, fraction = lax.while_loop(unfinished, advance, begin)
+        return place.q, before, going & (fraction > 0.0)
 
     def start(self, start: State, own: Float[Array, " k"]) -> Before:
         """How a way comes to its start: by the speeds there; the rank is that a little farther on."""
