@@ -217,7 +217,8 @@ def linearise(
             raise ValueError("linearise inside a JAX transformation needs degrees_of_freedom=; give their number")
         degrees_of_freedom = mechanism.topology.num_speeds - int(rank)
     asked = whole_number(degrees_of_freedom, "degrees_of_freedom", least=0)
-    linearisation, steadiness, counted = _linearise(mechanism, state, t, asked, may_move(state))
+    most = min(asked, mechanism.topology.num_speeds)
+    linearisation, steadiness, counted = _linearise(mechanism, state, t, most, may_move(state))
     if concrete(counted) is not None and counted != asked:
         raise ValueError(f"degrees_of_freedom is {asked}; the mechanism has {counted} here: give that, or leave it out")
     if not all_concrete((linearisation, steadiness)):
