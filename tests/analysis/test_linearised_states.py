@@ -156,3 +156,9 @@ def test_what_never_stands_still_has_no_equilibrium():
     mechanism = pendulum(forces=[Counter()])
     with pytest.raises(lx.EquilibriumError, match="no equilibrium near this state"):
         lx.equilibrium(mechanism, lx.assemble(mechanism, {"hinge": -1.5}))
+
+
+def test_of_what_cannot_move():
+    held = pendulum(constraints=[lx.Drive("motor", "hinge", speed=0.0)])
+    found = lx.linearise(held, lx.State(jnp.zeros(1), jnp.zeros(1)))
+    assert found.eigenvalues.shape == found.natural_frequencies.shape == (0,)

@@ -23,6 +23,8 @@ _eig = one_by_one(lambda matrix: tuple(jnp.linalg.eig(matrix)))
 def _spectrum(matrix):
     """Eigenvalues and eigenvectors of a matrix, differentiable to any order; derivatives of equal ones are NaN."""
     found = _eigenpairs(matrix)
+    if not len(matrix):
+        return found
     equal = _equal_another(*lax.stop_gradient((matrix, *found)))
     return undefined_where((equal, equal), found, matrix)
 

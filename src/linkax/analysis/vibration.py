@@ -149,6 +149,8 @@ class _Moving(Nearby):
 
 def _orthonormal(columns, mass):
     """The same directions, orthonormal in the mass metric; columns of zeros stay so."""
+    if not columns.shape[1]:
+        return columns
     empty = jnp.diag((jnp.sum(columns**2, axis=0) == 0.0).astype(mass.dtype))
     return columns @ cholesky_inverse_by_elimination(columns.T @ mass @ columns + empty)[0].T
 
