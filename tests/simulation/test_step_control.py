@@ -15,8 +15,9 @@ from mechanisms import pendulum
 import linkax as lx
 from linkax.scenes import SCENES
 from linkax.simulation.integrate.diffrax_contract import StepError
-from linkax.simulation.integrate.projected_solver import Chord, retry_factors
-from linkax.simulation.integrate.step_control import MechanismControl
+from linkax.simulation.integrate.placement import GROWTH, Placement
+from linkax.simulation.integrate.projected_solver import Chord
+from linkax.simulation.integrate.step_control import AMPLIFIED, MechanismControl
 
 SCALES = jnp.array([1.0, 1e3])
 ARGS = SimpleNamespace(
@@ -30,7 +31,16 @@ ARGS = SimpleNamespace(
     times=None,
 )
 Y = jnp.array([1.0, 2e3, 3.0, 4e3, 0.0])
-FAR = StepError((jnp.zeros(2), jnp.zeros(2)), jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(0.5))
+ONE = jnp.asarray(1.0)
+FAR = StepError((jnp.zeros(2), jnp.zeros(2)), ONE, Placement(ONE, jnp.inf * ONE, 0.5 * ONE, ONE))
+
+
+def near(passes=1.0, follows=np.inf, gains=0.1, leaves=1.0, errors=FAR.error):
+    """A step with stages so close to a singular configuration, which half of it keeps as far away as it `gains`."""
+    placement = Placement(*map(jnp.asarray, (passes, follows, 0.5, gains)))
+    return StepError(errors, jnp.asarray(leaves), placement)
+
+
 CONTROLLERS = [
     diffrax.PIDController(rtol=1e-8, atol=1e-8),
     diffrax.ClipStepSizeController(diffrax.PIDController(rtol=1e-8, atol=1e-8), jump_ts=np.array([0.7])),
@@ -46,8 +56,9 @@ def adapt(controller, error, t0=0.0, t1=1.0, retries=0):
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_a_stage_close_to_a_singular_configuration_is_moved_away(controller):
-    keep, next_t0, next_t1, _, (_, retries, _), _ = adapt(controller, FAR._replace(passes=jnp.asarray(1e-3)))
+@pytest.mark.parametrize("step", [near(1e-3), near(follows=1e-3)], ids=["its own", "of the next step"])
+def test_a_stage_close_to_a_singular_configuration_is_moved_away(controller, step):
+    keep, next_t0, next_t1, _, (_, retries, _), _ = adapt(controller, step)
     assert not keep
     assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
 
@@ -55,9 +66,11 @@ def test_a_stage_close_to_a_singular_configuration_is_moved_away(controller):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_an_error_from_such_a_stage_does_not_choose_the_next_try(controller):
     """It is rounding, however short the step: steps cut by it would crawl into the singular configuration."""
-    error = FAR._replace(error=(jnp.array([1e-4, 0.0]), jnp.zeros(2)))
-    assert adapt(controller, error)[2] < 0.5
-    keep, next_t0, next_t1, _, (_, retries, _), _ = adapt(controller, error._replace(passes=jnp.asarray(1e-3)))
+    errors = jnp.array([1e-4, 0.0]), jnp.zeros(2)
+    # A step that is not taken is not placed for the next one.
+    assert adapt(controller, FAR._replace(error=errors))[2] < 0.5
+    assert adapt(controller, near(follows=1e-3, errors=errors))[2] < 0.5
+    keep, next_t0, next_t1, _, (_, retries, _), _ = adapt(controller, near(1e-3, errors=errors))
     assert not keep
     assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
 
@@ -66,9 +79,9 @@ def test_an_error_from_such_a_stage_does_not_choose_the_next_try(controller):
     "error",
     [
         FAR,
-        FAR._replace(passes=jnp.asarray(0.02)),
-        FAR._replace(leaves=jnp.asarray(0.0), passes=jnp.asarray(1e-6)),
-        FAR._replace(leaves=jnp.asarray(5e-3), passes=jnp.asarray(1e-3)),
+        near(0.02),
+        near(1e-6, gains=0.0, leaves=0.0),
+        near(1e-3, gains=1.5e-3, leaves=5e-3),
     ],
     ids=["far", "far enough", "from a singular configuration", "as far as a step from so close can keep"],
 )
@@ -80,17 +93,16 @@ def test_other_steps_are_kept(error):
 
 
 def test_it_gives_up_after_some_tries():
-    near = FAR._replace(passes=jnp.asarray(1e-3))
-    tried = [bool(adapt(CONTROLLERS[0], near, retries=retries)[0]) for retries in range(8)]
+    tried = [bool(adapt(CONTROLLERS[0], near(1e-3), retries=retries)[0]) for retries in range(8)]
     assert tried == sorted(tried)
     assert not tried[0]
     assert tried[-1]
 
 
 def test_fixed_steps_are_left_alone():
-    near, far = (adapt(diffrax.ConstantStepSize(), FAR._replace(passes=jnp.asarray(d))) for d in (1e-3, 1.0))
-    assert near[0]
-    assert near[:3] == far[:3]
+    close, far = (adapt(diffrax.ConstantStepSize(), near(d)) for d in (1e-3, 1.0))
+    assert close[0]
+    assert close[:3] == far[:3]
 
 
 def test_errors_count_in_the_units_of_the_mechanism_less_rounding():
@@ -115,17 +127,23 @@ def test_rounding_in_an_estimate_does_not_choose_the_next_step():
     assert next_step(1e-14) == next_step(3e-14) > next_step(1e-11)
 
 
-def test_rounding_grows_near_a_singular_configuration_up_to_the_rank_tolerance():
-    tight = diffrax.PIDController(rtol=1e-30, atol=1e-30)
-    ends = lambda size, d: FAR._replace(
-        error=(jnp.array([size, 0.0]), jnp.zeros(2)), leaves=jnp.asarray(0.0), passes=jnp.asarray(d)
-    )
-    kept = lambda size, d: bool(adapt(tight, ends(size, d))[0])
-    far = FAR._replace(error=(jnp.array([1e-13, 0.0]), jnp.zeros(2)))
-    assert not bool(adapt(tight, far)[0])
-    assert kept(1e-13, 1e-4)
-    assert kept(2e-10, 1e-9)
-    assert not kept(5e-10, 1e-9)
+def test_rounding_grows_near_a_singular_configuration_like_its_square():
+    """Where a step comes close that cannot be placed better, but not from a singular configuration, without such rows."""
+    tight, turn, eps = diffrax.PIDController(rtol=1e-30, atol=1e-30), 4.0, np.finfo(float).eps
+
+    def kept(size, **step):
+        return bool(adapt(tight, near(errors=(jnp.array([size, 0.0]), jnp.zeros(2)), **step), retries=4)[0])
+
+    for d, least in ((1e-2, 1e-2), (1e-4, 1e-4), (1e-9, 1e-6)):
+        rounding = eps * (1.0 / least + AMPLIFIED * turn / least**2)
+        for step in ({"passes": d, "gains": 0.0}, {"leaves": max(d, 1e-6), "gains": 0.0}):
+            assert kept(0.99 * rounding, **step)
+            assert not kept(1.01 * rounding, **step)
+    others = (1e-4, {"passes": 1e-4, "gains": 1e-2}), (1e-6, {"passes": 1e-2, "gains": 0.0, "leaves": 0.0})
+    for d, step in others:
+        rounding = eps * (1.0 / d + AMPLIFIED * turn / 1e-2**2)
+        assert kept(0.99 * rounding, **step)
+        assert not kept(1.01 * rounding, **step)
 
 
 def test_from_a_state_that_is_not_sound_no_step_is_taken(monkeypatch):
@@ -141,8 +159,7 @@ def test_from_a_state_that_is_not_sound_no_step_is_taken(monkeypatch):
 
 def test_under_jit_vmap_and_both_modes():
     def next_step(size, passes):
-        error = StepError((size * jnp.ones(2), jnp.zeros(2)), jnp.asarray(1.0), passes, jnp.asarray(0.5))
-        keep, _, next_t1, *_ = adapt(CONTROLLERS[0], error)
+        keep, _, next_t1, *_ = adapt(CONTROLLERS[0], near(passes, errors=(size * jnp.ones(2), jnp.zeros(2))))
         return jnp.where(keep, next_t1, -next_t1)
 
     sizes, passes = jnp.array([1e-9, 1e-9, 1e-7]), jnp.array([0.5, 1e-3, 0.5])
@@ -154,12 +171,25 @@ def test_under_jit_vmap_and_both_modes():
 
 
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Kvaerno5()])
-def test_an_event_at_any_node_is_moved_between_nodes(solver):
-    nodes = np.asarray(solver.tableau.c, dtype=float)
-    for node, factor in zip(nodes, retry_factors(nodes), strict=True):
-        assert 0.0 < factor <= 1.0
-        gaps = np.abs(np.array([0.0, *nodes]) - node / factor)
-        assert np.min(gaps) >= 0.02, (node, factor)
+def test_a_passage_anywhere_falls_between_stages_of_this_step_or_the_next(solver):
+    """Of a distance that falls and rises like |t − t*|: told is what a step that is cut, and the next, come to."""
+    nodes, rate = np.unique(np.asarray(solver.tableau.c, dtype=float)), 0.1
+    distances = lambda ends, place: rate * np.abs(np.asarray(ends) - place)
+    of = jax.jit(lambda place: Placement.of(nodes, *(rate * jnp.abs(ends - place) for ends in (0.0, nodes, 1.0))))
+    for place in np.linspace(0.03, 2.5, 60):
+        found = of(place)
+        np.testing.assert_allclose(found.passes, np.min(distances(nodes, place)), rtol=1e-12)
+        cut = float(found.retry)
+        assert 0.0 < cut < 1.0 or not float(found.gains)
+        following = cut + min(GROWTH * cut, 1.0) * nodes
+        reached = np.min(distances([*(cut * nodes), *following], place))
+        assert reached >= 0.999 * float(found.gains)
+        # Close is only what begins close, or a stage after the end of a step.
+        if place < 1.0 or nodes[-1] == 1.0:
+            assert max(min(found.passes, found.follows), found.gains) >= 0.1 * rate * min(place, 0.2), place
+    for leaves, arrives in ((0.0, 0.1), (0.05, 0.1)):  # from a singular configuration, and away from one
+        still = Placement.of(nodes, jnp.asarray(leaves), leaves + (arrives - leaves) * nodes, jnp.asarray(arrives))
+        assert float(still.gains) == 0.0
 
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])

@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Float
 
 from linkax.model.topology import Topology
+from linkax.simulation.integrate.placement import Placement
 from linkax.simulation.integrate.switches import Sides
 from linkax.xla.arrays import Array
 
@@ -34,8 +35,7 @@ class StepError(NamedTuple):
 
     - `error`: estimates of q and v, and of internal states where there are some, or None.
     - `leaves`: distance d from the nearest singular configuration where the step begins.
-    - `passes`: the smallest d of its other stages. `retry`: by how much to change the step so that
-      what passes there falls between two stages.
+    - `placement`: of its stages next to one.
     - `opens`: the largest gap of the loops on the way, where states between steps are read before they are corrected
       [rad, lengths of the mechanism]; None without loops.
     - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
@@ -44,8 +44,7 @@ class StepError(NamedTuple):
 
     error: Any
     leaves: Float[Array, ""]
-    passes: Float[Array, ""]
-    retry: Float[Array, ""]
+    placement: Placement
     opens: Float[Array, ""] | None = None
     switch: Float[Array, ""] | None = None
 

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from linkax.model.numbers import Number
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import SolverState, StepError, stage_distances
+from linkax.simulation.integrate.placement import Placement
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.integrate.switches import Sides, crossed, meet
@@ -26,24 +27,6 @@ from linkax.xla.tracing import without_derivatives
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
 STAGNATES = 0.9  # rate at which they no longer fall
 ON_THE_WAY = np.array([0.3, 0.6, 0.9])  # of a step: where loops are looked at
-BEYOND = 1.5  # how far after its end a step may leave a passage, in steps
-
-
-def retry_factors(nodes: Float[Array, " n"]) -> Float[np.ndarray, " n"]:
-    """The factors by which to change a step that meets an event at one of its nodes.
-
-    For each node of a Runge-Kutta tableau in (0, 1] the factor that brings the event as far from
-    all nodes as possible, into the middle of a gap between later ones or after the step's end.
-    """
-    nodes = np.asarray(nodes, dtype=float)
-    ends = np.unique([*nodes[nodes > 0.0], BEYOND])
-    middle, clearance = (ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2
-
-    def factor(node):
-        later = middle >= node
-        return node / middle[later][np.argmax((clearance / middle)[later])]
-
-    return np.array([factor(node) if node > 0.0 else 1.0 for node in nodes])
 
 
 class StageNorm(eqx.Module):
@@ -216,13 +199,14 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             errors = None if error is None else args.errors(y1, error)
         errors = jax.tree.map(lambda error: jnp.where(failed, jnp.inf, error), errors)
         if stages is None:
-            passes, retry = arrives, jnp.ones_like(arrives)
+            placement = Placement.unknown(arrives)
         else:
             inner_solver: Any = self.solver
-            nearest = jnp.argmin(stages[1:])
-            leaves, passes = stages[0], stages[1:][nearest]
-            retry = jnp.asarray(retry_factors(inner_solver.tableau.c), passes.dtype)[nearest]
-        closest = jnp.minimum(solver_state.closest, jnp.minimum(passes, arrives))
+            leaves = stages[0]
+            placement = Placement.of(
+                np.asarray(inner_solver.tableau.c, dtype=float), leaves, stages[1:], lax.stop_gradient(arrives)
+            )
+        closest = jnp.minimum(solver_state.closest, jnp.minimum(placement.passes, arrives))
         within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
         opens = switch = None
         if self.after_step and args.method.checks_loops(args.system.topology):
@@ -233,7 +217,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             switch, sides = lax.stop_gradient(meet(*fixed, within=within))
             _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
         state = SolverState(inner, arrives, closest)
-        return y1, StepError(errors, leaves, passes, retry, opens, switch), dense_info, state, result
+        return y1, StepError(errors, leaves, placement, opens, switch), dense_info, state, result
 
     def corrected(
         self, problem: Problem, t1: Float[Array, ""], y1: Float[Array, " n"], sides: Sides

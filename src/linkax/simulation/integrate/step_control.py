@@ -15,6 +15,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 
 NOISE_ULPS = 1.0
+AMPLIFIED = 0.1  # of turn / d²: what of rounding at a stage is in the estimate of a step's error
 SEEN_ULPS = 512.0  # of estimates: rounding changes larger ones by less than a hundredth
 SEEN = 1e-3  # of the tolerance, which is as small
 OPENS = 1e-3  # radians, or lengths of the mechanism: what loops may open between steps
@@ -23,7 +24,6 @@ FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 FIRST_TURN_SINGULAR = 1e-3  # from a singular configuration, where the first stage does not know all of the loops
 SMALLEST_STEP_ULPS = 4.0
 MOST_RETRIES = 4
-FEASIBLE = 0.1  # of a step's first distance: what any step can keep from a passage
 
 
 class ControlState(NamedTuple):
@@ -49,9 +49,9 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     near a singular configuration.
 
     An adaptive step with a stage close to a singular configuration is tried again, shorter, so that the configuration
-    falls between two stages, whatever its error: that is rounding of this stage. Where a few tries do not help, or the
-    step begins in the singular configuration, it is left as it is. A step that goes past a switch of a force element is
-    tried again up to there, see `linkax.simulation.integrate.switches`; the next one is as long as it was before.
+    falls between two stages, whatever its error: that is rounding of this stage. So is one that ends where the next one
+    could not be placed, see `linkax.simulation.integrate.placement`. A step that goes past a switch of a force element
+    is tried again up to there, see `linkax.simulation.integrate.switches`; the next one is as long as it was before.
 
     - `is_undifferentiated`: see `ProjectedSolver`.
     """
@@ -117,7 +117,8 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         """Accept or reject the step, and choose the next one; `y_error` is a `StepError`."""
         magnitude, candidate = (_magnitudes(args, y) for y in (y0, y1_candidate))
         measured = y_error.error is not None and self.is_adaptive
-        scaled = self._scaled_error(args, y_error, magnitude, candidate) if measured else None
+        turn = args.system.fastest(args.unpacked(y0)[1]) * (t1 - t0)
+        scaled = self._scaled_error(args, y_error, turn, magnitude, candidate) if measured else None
         before, retries, free = controller_state
         keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
             t0, t1, magnitude, candidate, args, scaled, error_order, before
@@ -133,9 +134,9 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             result = diffrax.RESULTS.where(holds, result, diffrax.RESULTS.dt_min_reached)
             state = ControlState(after, retries, free)
             return keep & holds, jnp.where(holds, next_t0, t0), next_t1, jump, state, result
-        near = jnp.minimum(args.accuracy.clearance, FEASIBLE * y_error.leaves)
-        again = (y_error.passes < near) & (retries < MOST_RETRIES)
-        end = t0 + y_error.retry * (t1 - t0)
+        placement = y_error.placement
+        again = placement.misplaced(args.accuracy.clearance, keep) & (retries < MOST_RETRIES)
+        end = t0 + placement.retry * (t1 - t0)
         if y_error.switch is not None:
             late = y_error.switch < 1.0
             to_switch = t0 + y_error.switch * (t1 - t0)
@@ -168,10 +169,16 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         ahead = jnp.append(problem.times, jnp.inf)[index]
         return jnp.minimum(t1, ahead), jnp.where(t1 > ahead, jnp.maximum(free, t1 - t0), free)
 
-    def _scaled_error(self, problem, y_error, magnitude, candidate):
+    def _scaled_error(self, problem, y_error, turn, magnitude, candidate):
         """The error of q, v and internal states in their scales, with rounding taken off."""
         scales = problem.scales
-        noise = _noise(jnp.minimum(y_error.leaves, y_error.passes), problem.method.distance_floor)
+        placement, floor = y_error.placement, problem.method.distance_floor
+        # Where another try comes less close, that is what is to be tried. A singular configuration amplifies nothing,
+        # as its rows count as dependent.
+        nearest = jnp.maximum(placement.passes, jnp.minimum(placement.gains, problem.accuracy.clearance))
+        nearest = jnp.where(y_error.leaves < floor, nearest, jnp.minimum(y_error.leaves, nearest))
+        closest = jnp.minimum(y_error.leaves, placement.passes)
+        noise = _noise(jnp.maximum(closest, floor), jnp.maximum(nearest, floor), turn)
         # The second is none where the step has led to no numbers.
         largest = jax.tree.map(lambda a, b: jnp.maximum(a, jnp.where(jnp.isfinite(b), b, 0.0)), magnitude, candidate)
         # An estimate that is rounding alone must not choose the next step: in a batch it would be another one.
@@ -196,12 +203,13 @@ def _magnitudes(problem, y):
     return of_motion if internal is None else (*of_motion, jnp.abs(internal / problem.scales[2]))
 
 
-def _noise(distance, nearest):
-    """Relative rounding along the motion: it grows like 1/d, up to 1/`nearest`.
+def _noise(closest, nearest, turn):
+    """Relative rounding in a step that turns joints by so much [radians, lengths of the mechanism].
 
-    Across the motion it grows like 1/d², but the correction takes that off.
+    It reaches coordinates multiplied by 1/d, however short the step, d the `closest` distance; accelerations and the
+    direction of motion by 1/d², d the `nearest` that no placement avoids.
     """
-    return NOISE_ULPS * jnp.finfo(distance.dtype).eps / jnp.maximum(distance, nearest)
+    return NOISE_ULPS * jnp.finfo(closest.dtype).eps * (1.0 / closest + AMPLIFIED * turn / nearest**2)
 
 
 def _less(error, noise):
