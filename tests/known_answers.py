@@ -6,12 +6,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
 from mechanisms import with_cut
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 from scipy.special import ellipj, ellipk
 
 import linkax as lx
+from linkax.equations.configuration import configure
+from linkax.equations.dynamics import mass_matrix, potential_energy
+from linkax.equations.system import system_of
 from linkax.scenes import SCENES
 
 
@@ -56,6 +62,55 @@ def rise_of_sarrus(angle, speed, duration):
 
     found = solve_ivp(rates, (0.0, duration), [angle, speed], method="DOP853", rtol=3e-14, atol=1e-15)
     return found.y[0, -1]
+
+
+class TimeOfTurn:
+    """When a linkage of one freedom in gravity reaches which turn φ of its first link: t = ∫ √(J / 2 (E − V)) dφ.
+
+    J and V are of period 2π, and the Fourier series of the integrand is integrated; the motion may not turn back.
+    `coordinates`: φ, (n,), ↦ q and its derivative by φ, (n, n_q).
+    """
+
+    def __init__(self, mechanism, coordinates, count=512):
+        self.coordinates, self.orders = coordinates, np.arange(count) - count // 2
+        system = system_of(mechanism, jnp.dtype(float))
+
+        def energies(q, slopes):
+            configuration = configure(system, 0.0, q)
+            return slopes @ mass_matrix(configuration) @ slopes, potential_energy(configuration)
+
+        found = jax.jit(jax.vmap(energies))(*coordinates(2.0 * np.pi * np.arange(count) / count))
+        self.inertia, self.potential = (np.asarray(part) for part in found)
+
+    def _series(self, values):
+        return np.fft.fftshift(np.fft.fft(values)) / len(values)
+
+    def _sum(self, series, turn):
+        return np.real(np.exp(1j * np.multiply.outer(turn, self.orders)) @ series)
+
+    def energy(self, above):
+        """The energy above the highest potential by so many times what that varies [J]."""
+        return np.max(self.potential) + above * np.ptp(self.potential)
+
+    def speed(self, turn, energy):
+        """φ̇ there, as it rises [1/s]."""
+        inertia, potential = (self._sum(self._series(part), turn) for part in (self.inertia, self.potential))
+        return np.sqrt(2.0 * (energy - potential) / inertia)
+
+    def clock(self, energy):
+        """φ ↦ t, as φ rises."""
+        series = self._series(np.sqrt(self.inertia / (2.0 * (energy - self.potential))))
+        assert np.abs(series[0]) <= 1e-13 * np.max(np.abs(series))  # so many orders are enough
+        integral = np.divide(series, 1j * self.orders, out=np.zeros_like(series), where=self.orders != 0)
+        mean = np.real(series[self.orders == 0][0])
+        return lambda turn: mean * np.asarray(turn) + self._sum(integral, turn)
+
+    def turn(self, energy, time):
+        """The turn at a time of the clock."""
+        clock = self.clock(energy)
+        periods = np.floor(time / (clock(2.0 * np.pi) - clock(0.0)))
+        about = 2.0 * np.pi * periods
+        return brentq(lambda turn: clock(turn) - time, about - 4.0 * np.pi, about + 4.0 * np.pi, xtol=1e-14, rtol=1e-14)
 
 
 def turning(parameters, forces=None):

@@ -6,6 +6,7 @@ joints, beams, forces and constraints, for laws that hold for all of them.
 """
 
 import copy
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -145,6 +146,45 @@ def raised_exactly(mechanism, angle, speed):
     of_joint = {"base": (angle, speed), "knee": (np.pi - 2.0 * angle, -2.0 * speed), "top": (angle - np.pi, speed)}
     of_coordinates = [of_joint[name.split("_")[0]] for name in mechanism.topology.coordinates]
     return lx.State(*(np.array(part) for part in zip(*of_coordinates, strict=True)))
+
+
+# Axes in the plane z = 0 as drawn, a place on each, and k of tan(angle / 2) = k tan(turn / 2), exactly.
+HINGES = {
+    "h1": ((1, 0), (0, 0), 1.0),
+    "h2": ((0, 1), (1 / 3, 0), 3.0),
+    "h3": ((1, 1), (-1, 1), 2**0.5),
+    "k1": ((47, 23), (276 / 1369, -564 / 1369), 2**0.5),
+    "k2": ((-93, 1440), (-164 * 1440 / 1443**2, -164 * 93 / 1443**2), 3.0),
+    "k3": ((12, 5), (-85 / 169, 204 / 169), 1.0),
+}
+
+
+def folding():
+    """A redundant loop of six hinges, which lie in a plane twice a turn: the rank falls from 4 to 2."""
+    names = "A1", "A2", "tool", "B2", "B1"
+    bodies = {
+        name: lx.RigidBody(name, 1.0 + 0.2 * i, [0.1 * i - 0.2, 0.2, 0.05 * i], [0.1, 0.12, 0.15])
+        for i, name in enumerate(names)
+    }
+    chains = (
+        [lx.GROUND, bodies["A1"], bodies["A2"], bodies["tool"]],
+        [lx.GROUND, bodies["B1"], bodies["B2"], bodies["tool"]],
+    )
+    pairs = [pair for chain in chains for pair in itertools.pairwise(chain)]
+    joints = [
+        lx.Revolute(name, parent.at([*place, 0.0]), child.at([*place, 0.0]), axis=[*axis, 0.0])
+        for (name, (axis, place, _)), (parent, child) in zip(HINGES.items(), pairs, strict=True)
+    ]
+    return lx.Mechanism(list(bodies.values()), joints, [lx.Gravity([0.0, 0.0, -9.81])])
+
+
+def folded(mechanism, turn):
+    """Coordinates of `folding` at turns of its first hinge, (..., n_q), and their derivatives by it."""
+    rates = np.array([HINGES[name][2] for name in mechanism.topology.coordinates])
+    whole = np.round(np.asarray(turn)[..., None] / (2.0 * np.pi))
+    half = np.asarray(turn)[..., None] / 2.0 - np.pi * whole
+    cosine, sine = np.cos(half), rates * np.sin(half)
+    return 2.0 * np.arctan2(sine, cosine) + 2.0 * np.pi * whole, rates / (cosine**2 + sine**2)
 
 
 def with_cut(mechanism, name):

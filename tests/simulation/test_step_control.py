@@ -128,7 +128,7 @@ def test_rounding_in_an_estimate_does_not_choose_the_next_step():
 
 
 def test_rounding_grows_near_a_singular_configuration_like_its_square():
-    """Where a step comes close that cannot be placed better, but not from a singular configuration, without such rows."""
+    """Where no placement keeps a step away; and not from a singular configuration, where such rows are none."""
     tight, turn, eps = diffrax.PIDController(rtol=1e-30, atol=1e-30), 4.0, np.finfo(float).eps
 
     def kept(size, **step):

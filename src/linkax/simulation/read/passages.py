@@ -16,7 +16,7 @@ from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.explain.error_estimate import has_parts, num_saves, part_of_run
-from linkax.simulation.integrate.results import ENDED_WELL, Solution, result_name
+from linkax.simulation.integrate.results import ENDED_WELL, SimulationError, Solution, result_name
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
 from linkax.xla.program import Program
@@ -28,7 +28,7 @@ PRECISE = 3e-9  # of the whole time: what a polynomial between saved states may 
 VANISHED = 0.1  # of the distances before and after: what a passage falls below
 TOGETHER = 1e-6  # of the whole time: passages that close are of several loops at once
 ALIKE = 1e-6  # relative: eigenvalues that pass through zero as one
-SINGULAR = 1e-4  # distance below which a state is on no side of a passage
+SINGULAR = 2e-6  # distance below which a state is on no side of a passage: twice the rank tolerance
 FASTEST = 10.0  # that distances change, per radian or length of the mechanism
 BATCH = 64  # intervals that one program looks at
 
@@ -97,7 +97,8 @@ class _Passage(NamedTuple):
 def passages(solution: Solution) -> Passages:
     """Find the passages of one `linkax.Solution`.
 
-    **Raises:** `ValueError` for a batch, or where the solution saved functions of its own.
+    **Raises:** `ValueError` for a batch, or where the solution saved functions of its own; `SimulationError` where the
+    motion has to be run again, and fails.
     """
     found = _passages(solution)
     times = np.array([passage.time for passage in found])
@@ -167,10 +168,16 @@ def _close_enough(solution) -> Samples:
     parts = -(-2 * steps // (saves - 1))
     for begin, end in itertools.pairwise(np.linspace(float(t0), float(solution.t_end), parts + 1)):
         part = solution.another(part_of_run(solution, state, np.linspace(begin, end, saves)))
-        if result_name(part.result) not in ENDED_WELL:
-            break
         more, state = Samples.of(part), part.end
         found = more if found is None else found.then(more)
+        if result_name(part.result) not in ENDED_WELL:
+            if result_name(solution.result) in ENDED_WELL:
+                raise SimulationError(
+                    f"a part of the motion, run again from {begin:.6g} s to see where it passes singular "
+                    f"configurations, fails at {float(part.t_end):.6g} s; save at least {2 * steps} times",
+                    part,
+                )
+            break
     return samples if found is None else found
 
 
