@@ -135,3 +135,18 @@ def test_many_starts_of_a_linkage_without_passages():
         ends = {name: one.q[-1] for name, one in found.items()}
         assert np.max(np.abs(ends["DRAFT"] - ends["PRECISE"])) <= MOST["DRAFT"]
         assert np.max(np.abs(ends["BALANCED"] - ends["PRECISE"])) <= MOST["BALANCED"]
+
+
+@pytest.mark.parametrize("turn", [1e-2, 1e-4, 1e-6])
+def test_a_guess_that_closes_the_loops_stays_as_it_is(turn):
+    """To the last bit, though next to a singular configuration rounding of the loops allows other coordinates."""
+    mechanism = folding()
+    q, slopes = folded(mechanism, turn)
+    names = list(mechanism.topology.coordinates)
+    speeds = dict(zip(names, 4.0 * slopes, strict=True))
+    for asked in (["h1"], ["h1", "h2", "h3"]):
+        state = lx.assemble(
+            mechanism, {}, {name: speeds[name] for name in asked}, guess=dict(zip(names, q, strict=True))
+        )
+        assert np.all(state.q == q)
+        np.testing.assert_allclose(state.v, 4.0 * slopes, atol=1e-10)

@@ -23,7 +23,7 @@ from linkax.xla.static_scatter import scatter_static
 MOST_STEPS = 100
 LONGEST_STEP = 0.7  # radians, or lengths of the mechanism
 STEP_FRACTIONS = 0.5 ** np.arange(6)
-SMALL = 1e-15
+ROUNDING_ULPS = 8.0  # of residuals: a state that misses by no more stays as it is
 CLOSED = 1e-9  # remaining gap, relative to the mechanism's length
 # Starts of the search beside the guess, by which it leaves a saddle of the gap, or a bad guess.
 ATTEMPTS = np.array([0.0, 1e-2, 1e-1, 0.3, 0.3, 0.6, 0.6, 1.0, 1.0, 1.0, 1.5, 1.5, 1.5, 1.5, 3.0, 3.0, 3.0, 3.0])
@@ -114,6 +114,7 @@ class LoopClosure(eqx.Module):
         **Returns:** the coordinates reached, and the size of the residuals there.
         """
         metrics = self.metrics() if len(strains_of(self.system)) else None
+        small = ROUNDING_ULPS * jnp.finfo(q.dtype).eps
 
         def newton(rows, slopes, back):
             if metrics is None:
@@ -142,10 +143,11 @@ class LoopClosure(eqx.Module):
             tries = jnp.concatenate([tries, q[None]])
             sizes = jax.vmap(self.size)(tries)
             misses = sizes + jax.vmap(strained)(tries)
-            best = jnp.argmin(misses)
+            # Next to a singular configuration a change of rounding is amplified, and closes nothing.
+            best = jnp.where(misses[-1] <= small, len(tries) - 1, jnp.argmin(misses))
             return (tries[best], sizes[best]), misses[best]
 
-        return while_falling(improve, (q, jnp.asarray(jnp.inf, q.dtype)), MOST_STEPS, SMALL, q.dtype)
+        return while_falling(improve, (q, jnp.asarray(jnp.inf, q.dtype)), MOST_STEPS, small, q.dtype)
 
     def search(self, q: Float[Array, " n_q"]) -> Float[Array, " n_q"]:
         """Find coordinates that close the loops, from q, or else from beside it; those nearest to it where none do."""
