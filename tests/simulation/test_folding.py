@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -150,3 +151,18 @@ def test_a_guess_that_closes_the_loops_stays_as_it_is(turn):
         )
         assert np.all(state.q == q)
         np.testing.assert_allclose(state.v, 4.0 * slopes, atol=1e-10)
+
+
+@pytest.mark.parametrize("asked", [["h1"], ["h1", "h2"], ["h1", "h2", "h3"]])
+def test_speeds_of_a_flat_linkage_are_completed_to_its_one_branch(asked):
+    """Three equations for two speeds, whose search ends beside a solution from some starts."""
+    mechanism = folding()
+    speeds = 2.0 * folded(mechanism, 0.0)[1]
+    given = {name: speeds[mechanism.topology.speeds[name]][0] for name in asked}
+    np.testing.assert_allclose(lx.assemble(mechanism, {}, given).v, speeds, rtol=1e-9)
+
+
+def test_derivatives_of_speeds_of_a_flat_linkage():
+    mechanism = folding()
+    slopes = jax.jacfwd(lambda speed: lx.assemble(mechanism, {}, {"h1": speed}).v)(2.0)
+    np.testing.assert_allclose(slopes, folded(mechanism, 0.0)[1], rtol=1e-9)

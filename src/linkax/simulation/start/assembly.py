@@ -80,7 +80,8 @@ def assemble(
     not reach closed loops from the guess, it starts again beside it, a little and then farther. Strains of beams stay
     as guessed, by default zero; where no start closes the loops so, they change, with little energy. In a singular
     configuration, where branches of the motion cross, speeds lie on the branch of the position where it is a little off
-    (1e-9), else on the branch nearest to these; give more of them to choose another.
+    (1e-9), else on a branch near these, which outside of JAX transformations is looked for from other speeds, too; give
+    more of them to choose another.
 
     Differentiable in the numbers of the mechanism, positions, speeds and the guess, to any order. A coordinate that is
     neither held nor decided by the loops has the derivative of the nearest to the guess, as if the guess closed the
@@ -155,8 +156,21 @@ def _assembled(*given):
         return _assemble(*given, branches=True)
     state, remainder = _assemble(*near, branches=False)
     if branches := bool(remainder.undecided):
-        state, remainder = _assemble(*near, branches=True)
-    return (state if all_concrete(given) else _assembled_again(given, state.q, branches)), remainder
+        state, remainder = _on_any_branch(near, *_assemble(*near, branches=True))
+    return (state if all_concrete(given) else _assembled_again(given, state, branches)), remainder
+
+
+def _on_any_branch(given, state, remainder):
+    """The state with the smallest speeds on a branch that other starts find, where the search has ended beside all."""
+    if remainder.is_on_branch(state.q.dtype):
+        return state, remainder
+    flat, _, speeds, _, t = given
+    found, are_some = other_speeds(flat.tree, speeds, t, state.q, state.v)
+    if not np.any(are_some):
+        return state, remainder
+    sizes = jnp.linalg.norm(found / system_of(flat.tree, state.q.dtype).scales, axis=1)
+    v = found[jnp.argmin(jnp.where(are_some, sizes, jnp.inf))]
+    return dataclasses.replace(state, v=v), dataclasses.replace(remainder, off_branch=jnp.zeros_like(sizes[0]))
 
 
 @Program
@@ -191,12 +205,12 @@ def _assemble(flat, positions, speeds, guess, t, *, branches):
 
 
 @jit_inline
-def _assembled_again(given, q, branches):
-    """The state whose coordinates are known, for its derivatives."""
+def _assembled_again(given, found, branches):
+    """The state that was found, for its derivatives."""
     flat, positions, speeds, guess, t = given
     demand, begin = demand_of(flat, positions, guess, t)
-    q = close_loops(demand, begin, q)
-    v = speeds_again(configure(demand.system, t, q), speeds, branches)
+    q = close_loops(demand, begin, found.q)
+    v = speeds_again(configure(demand.system, t, q), speeds, found.v, branches)
     return State(q, v, demand.system.topology)
 
 

@@ -162,12 +162,12 @@ def speeds_on_branch(configuration: Configuration, held: JointValues) -> FoundSp
 
 
 @straight_line
-def speeds_again(configuration: Configuration, held: JointValues, branches: bool) -> Float[Array, " n_v"]:
-    """Find the same speeds again, (n_v,), for their derivatives."""
-    if branches:
-        return speeds_on_branch(configuration, held).v
+def speeds_again(
+    configuration: Configuration, held: JointValues, v: Float[Array, " n_v"], branches: bool
+) -> Float[Array, " n_v"]:
+    """Find the speeds v again, (n_v,), for their derivatives."""
     asked = _asked(configuration, held)
-    return asked.scale * asked.smallest()
+    return asked.scale * (_on_branch(asked, v / asked.scale) if branches else asked.smallest())
 
 
 def _found(asked, held, least, v, off_branch, undecided):

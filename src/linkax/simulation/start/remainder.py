@@ -40,6 +40,11 @@ class Remainder(eqx.Module):
     undecided: Array
     strained: dict
 
+    def is_on_branch(self, dtype: np.dtype) -> bool:
+        """Whether speeds that are known lie on a branch of the motion."""
+        # As arrays of NumPy, with which nothing is compiled.
+        return bool(np.asarray(self.off_branch) <= ON_BRANCH * np.asarray(rank_tolerance(dtype)))
+
     def is_met(self) -> Bool[Array, ""]:
         """Whether the loops are closed and all that is held is met."""
         missed = jnp.concatenate([self.positions.flat(), self.speeds.flat()])
@@ -125,12 +130,12 @@ def _open(mechanism, state, t, remainder) -> Iterator[str]:
                     f"the {what} asked of {called(along.joint)} is missed by {size:.6g}; the loops do not allow it "
                     f"together with the other {what}s given{f' ({drives})' if drives else ''}, so ask for fewer"
                 )
-    tolerance = np.asarray(rank_tolerance(state.q.dtype))  # with which nothing is compiled
-    if not remainder.off_branch <= ON_BRANCH * tolerance:
-        system = system_of(mechanism, state.q.dtype)
+    if not remainder.is_on_branch(state.q.dtype):
+        system, tolerance = system_of(mechanism, state.q.dtype), np.asarray(rank_tolerance(state.q.dtype))
         basis = ConstraintSplit.at(system, t, state.q, tolerance).inverse.basis
         names = ", ".join(map(repr, moving_joints(system, t, state.q, basis)))
         yield (
-            "the configuration is singular, and the speeds asked lie on no branch of the motion; its branches cross "
-            f"in the motion of joints {names}, so ask for the speeds of other joints among them, or of fewer"
+            "the configuration is singular, and no branch of the motion was found that has the speeds asked; its "
+            f"branches cross in the motion of joints {names}, so ask for speeds of one motion, and of more of these "
+            "joints"
         )
