@@ -24,6 +24,8 @@ def test_mobility_in_and_beside_a_singular_configuration():
     found = lx.mobility(mechanism, state)
     assert (found.rank, found.degrees_of_freedom, found.num_redundant) == (1, 2, 4)
     assert (found.spatial_count, found.planar_count) == (-2, 1)
+    assert found.distance == 0.0
+    assert "0 from a singular configuration (branches cross" in str(found)
     beside = lx.mobility(mechanism, lx.State(state.q + 0.1 * np.array([1.0, 1.0, -1.0]), state.v))
     assert (beside.rank, beside.degrees_of_freedom, beside.num_redundant) == (2, 1, 3)
     assert 0.01 < beside.distance < 0.2

@@ -18,6 +18,7 @@ from linkax.model.topology import Topology
 from linkax.simulation.integrate.accuracy import BALANCED, Accuracy
 from linkax.simulation.integrate.options import check_accuracy
 from linkax.simulation.integrate.run import DEFAULT_FORMULATION, checked_formulation
+from linkax.simulation.start.initial_state import ON_BRANCH
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
@@ -39,12 +40,14 @@ def _table(found: "Mobility") -> Table:
     title = f"Mobility: {freedoms} degree{'' if freedoms == '1' else 's'} of freedom"
     counts = [f"{found.spatial_count} in space"]
     counts += [] if found.planar_count is None else [f"{found.planar_count} in the plane"]
+    crossing = known(found.distance) is not None and np.all(np.asarray(found.distance) == 0.0)
+    far = "branches cross in it; fewer freedoms go on along each" if crossing else "1 is far"
     facts = [
         ("Grübler–Kutzbach", ", ".join(counts)),
         ("joint equations", f"{sum(equations.values())} on {count(topology.num_bodies, 'body')}"),
         ("loop equations", f"{total}, of rank {numbers(found.rank)}"),
         ("redundant", numbers(found.num_redundant)),
-        ("distance", f"{numbers(found.distance)} from a singular configuration (1 is far)"),
+        ("distance", f"{numbers(found.distance)} from a singular configuration ({far})"),
     ]
     names = [*redundant, *(name for name in equations if name not in redundant)]
     rows = [(name, str(equations[name]), redundant.get(name, "")) for name in names]
@@ -59,8 +62,9 @@ class Mobility(eqx.Module):
     - `rank`: number of independent constraint rows.
     - `degrees_of_freedom`: n_v − rank; each row that a singular configuration makes dependent adds one.
     - `num_redundant`: number of rows that depend on others, including rows that no motion changes.
-    - `distance`: from the nearest singular configuration, see `linkax.Accuracy`. Exactly in one, the smaller `rank`
-      shows it, and not this number. NaN where a number that JAX traces is not one that it can be.
+    - `distance`: from the nearest singular configuration, see `linkax.Accuracy`; zero in one, where branches cross, and
+      motions can take only some of the degrees of freedom. NaN where a number that JAX traces is not one that it can
+      be.
     - `is_planar`: whether all joints turn about one direction, and slide across it.
     - `dispensable`: whether each constraint row, in the order of `rows`, could be left out without freeing a motion,
       (m,).
@@ -182,6 +186,9 @@ def _mobility(mechanism, state, t, tangent_space):
     tolerance = tangent_space.prepared(system.dtype).tolerance
     split = ConstraintSplit.at(system, t, state.q, tolerance)
     rank, rows = jnp.sum(split.inverse.rank), split.jacobian
+    distance = singularity_distance(None, rows, system.scales, tolerance, system.structure.islands)
+    if topology.num_rows:
+        distance = jnp.where(split.is_crossing(ON_BRANCH * tolerance), 0.0, distance)
     dispensable = jnp.zeros(0, bool)
     if topology.num_rows:
         free = least_multipliers(rows, rows[:, 0], system.scales, tolerance, rank).free
@@ -190,7 +197,7 @@ def _mobility(mechanism, state, t, tangent_space):
         rank=rank,
         degrees_of_freedom=topology.num_speeds - rank,
         num_redundant=topology.num_rows + topology.num_immobile_rows - rank,
-        distance=singularity_distance(None, rows, system.scales, tolerance, system.structure.islands),
+        distance=distance,
         dispensable=jnp.concatenate([dispensable, jnp.ones(topology.num_immobile_rows, bool)]),
         topology=topology,
         is_planar=is_planar(mechanism),

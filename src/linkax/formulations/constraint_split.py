@@ -91,6 +91,13 @@ class ConstraintSplit(eqx.Module):
     def _rounding(self, driven):
         return SEEN_ULPS * jnp.finfo(driven.dtype).eps * largest(driven) / self.inverse.distance
 
+    def is_crossing(self, tolerance: ScalarLike) -> Bool[Array, ""]:
+        """Whether branches cross here: speeds that J leaves open are not all those of motions."""
+        basis = self._basis_of_ones()
+        speeds = basis @ np.random.default_rng(0).normal(size=basis.shape[1]).astype(basis.dtype)
+        outside = self._outside(self._bias(speeds))
+        return largest(outside) > tolerance * self.configuration.system.fastest(speeds) ** 2
+
     def along(
         self, v: Float[Array, " n_v"], from_rest: bool | Bool[Array, ""]
     ) -> tuple[Float[Array, " m"], Int[Array, " k"]]:
