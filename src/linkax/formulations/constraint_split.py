@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from linkax.equations.configuration import Configuration, configure
@@ -86,7 +87,8 @@ class ConstraintSplit(eqx.Module):
 
     def slowest(self) -> Float[Array, ""]:
         """The largest speed up to which rounding of what drives ask for hides whether speeds are on a branch."""
-        return jnp.sqrt(self._rounding(self.driven(jnp.zeros_like(self.configuration.system.scales))))
+        rounding = self._rounding(self.driven(jnp.zeros_like(self.configuration.system.scales)))
+        return jnp.sqrt(lax.stop_gradient(rounding))  # whose slope at zero is none
 
     def _rounding(self, driven):
         return SEEN_ULPS * jnp.finfo(driven.dtype).eps * largest(driven) / self.inverse.distance
