@@ -61,7 +61,8 @@ class Symmetry(eqx.Module):
     @staticmethod
     def through(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> "Symmetry":
         """The one of constant speeds v."""
-        topology, sliding = system.topology, configure(system, t, q).sliding
+        topology = system.topology
+        sliding = configure(system, t, q).sliding
         fixed = np.isin(np.arange(len(v)), np.concatenate([[], *_ground_slides(topology)]))
         axes = jnp.where(fixed[:, None], jnp.zeros((len(v), 3), v.dtype).at[topology.motions[:, 1]].set(sliding), 0.0)
         return Symmetry(topology, axes, v, jnp.zeros(num_turns(topology), v.dtype))
@@ -103,7 +104,11 @@ class Symmetry(eqx.Module):
         self, q: Float[Array, " n_q"], changes: Float[Array, "n_v k"], duration: Float[Array, ""]
     ) -> tuple[Float[Array, " n_q"], Float[Array, "n_v k"]]:
         """Coordinates and small changes of them after a time [s]."""
-        topology, of_each = self.topology, lambda function: jax.vmap(function, in_axes=1, out_axes=1)
+        topology = self.topology
+
+        def of_each(function):
+            return jax.vmap(function, in_axes=1, out_axes=1)
+
         if not len(self.turns):
             motion = duration * self.constant
             return retract(topology, q, motion), of_each(lambda change: carried(topology, motion, change))(changes)

@@ -79,7 +79,9 @@ class _Moving(Nearby):
     ) -> tuple["_Moving", Int[Array, ""]]:
         """The mechanism there, and how many degrees of freedom it has."""
         departure = method.at_rest(system, t, q)
-        rows, inverse, mass = departure.split.jacobian, departure.split.inverse, departure.mass
+        rows = departure.split.jacobian
+        inverse = departure.split.inverse
+        mass = departure.mass
         still, slips = jnp.zeros(len(rows), mass.dtype), system.topology.slips
 
         def tangent(column):
@@ -129,7 +131,8 @@ class _Moving(Nearby):
 
     def coefficients(self) -> tuple[Float[Array, " d"], Float[Array, "h h"], Float[Array, "h h"]]:
         """ÿ at y = ẏ = 0, −∂/∂y of ÿ, with zeros below, and −∂/∂ẏ of it, with ∂/∂y of ẏ of what is barred below."""
-        count, degrees = self.basis.shape[1], self.degrees_of_freedom
+        count = self.basis.shape[1]
+        degrees = self.degrees_of_freedom
         of_both = lambda both: self.rates(*jnp.split(both, [count]))[0]
         rates, slopes = self.slopes(of_both, jnp.zeros(count + degrees, self.basis.dtype))
         by_place, by_rate = jnp.split(-slopes, [count], axis=1)

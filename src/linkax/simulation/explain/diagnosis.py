@@ -13,7 +13,7 @@ from linkax.equations.constraint_rows import constraint_gamma, constraint_rate, 
 from linkax.equations.dynamics import mass_matrix
 from linkax.equations.gaps import gaps
 from linkax.equations.internal_states import bound
-from linkax.equations.loops import jacobian, residual
+from linkax.equations.loops import jacobian, widest
 from linkax.equations.motion import move
 from linkax.equations.system import System, system_of
 from linkax.formulations.classical import ClassicalFormulation
@@ -136,7 +136,7 @@ def _drives(solution, system, t):
     small = jnp.sqrt(jnp.finfo(system.dtype).eps)
     for ahead in AHEAD * float(jnp.abs(t) + 1.0) if drives else ():
         q, _ = method.close(system, t + ahead, end.q, end.v)
-        if not float(jnp.max(jnp.abs(residual(configure(system, t + ahead, q))))) < small:
+        if not float(widest(configure(system, t + ahead, q))) < small:
             asked = [f"{drive.display_name} of joint {drive.joints[0]!r}" for drive in drives]
             return f" The {' and the '.join(asked)} asks for what the loops do not allow after t = {float(t):.6g} s."
     return ""

@@ -115,7 +115,8 @@ def meet(
     **Returns:** the share of the step up to the first switch, one for none; the sides after a step that goes past none,
     with impacts counted, and not yet happened.
     """
-    kept, eps = problem.sides(y0), jnp.finfo(y0.dtype).eps
+    kept = problem.sides(y0)
+    eps = jnp.finfo(y0.dtype).eps
     stops, num = impacts.places(problem.system), sum(force.has_switch for force in problem.system.forces)
     sides = kept[:num]
     duration = t1 - t0

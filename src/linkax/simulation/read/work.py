@@ -30,7 +30,8 @@ def work(solution: Solution) -> dict[str, Float[Array, "*batch n_t"]]:
     mechanism, (forces, drives) = solution.mechanism, do_work(solution.mechanism)
     names = [mechanism.force_names[index] for index in forces]
     names += [mechanism.topology.constraints[index] for index in drives]
-    works, of_stops = _between_saved_times(solution), _of_impacts(solution)
+    works = _between_saved_times(solution)
+    of_stops = _of_impacts(solution)
     if names and solution.ts.ndim == 1 and all_concrete(works) and has_parts(solution):
         works = _resolved(solution, np.array(works), np.sum(of_stops, axis=0))
     names += [
