@@ -168,7 +168,7 @@ def _sensitivity(problem, t0, t1, y0, y1, at_end):
 
     def changed(seed):
         random = np.random.default_rng(seed)
-        either = lambda number: PROBE * random.choice([-1.0, 1.0], np.shape(number))
+        either = lambda number: jnp.asarray(PROBE * random.choice([-1.0, 1.0], np.shape(number)), number.dtype)
         other = lambda leaf: leaf * (1.0 + either(leaf)) if eqx.is_inexact_array(leaf) else leaf
         forces = jax.tree.map(other, system.forces)
         near = dataclasses.replace(system, forces=forces, known=None)
