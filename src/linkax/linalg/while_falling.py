@@ -18,18 +18,20 @@ def while_falling(
     most: int,
     small: ScalarLike,
     dtype: np.dtype,
+    least_fall: float = 0.0,
 ) -> Carry:
     """Iterate until the residual is small, stops falling, or `most` iterations are done; at least once.
 
     **Arguments:** `improve`: (state, residual of the iteration before, at first as large as can be) ↦ (state,
-    residual); `begin`: the first state; `dtype`: floating-point type of the residual.
+    residual); `begin`: the first state; `dtype`: floating-point type of the residual; `least_fall`: the share of the
+    residual below which an iteration does not count as falling.
 
     **Returns:** the last state.
     """
 
     def unfinished(carry):
         count, _, missed, before = carry
-        return (count == 0) | ((count < most) & (missed > small) & (missed < before))
+        return (count == 0) | ((count < most) & (missed > small) & (missed < (1.0 - least_fall) * before))
 
     def iterate(carry):
         count, state, before, _ = carry

@@ -20,7 +20,6 @@ from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.saddle_inverse import invert
-from linkax.model.constraints.constraint import Drive
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.results import RESULTS, Solution
 from linkax.simulation.start.initial_state import MOVES, moving_joints
@@ -131,14 +130,17 @@ def _exhausted(solution, system, t):
 
 def _drives(solution, system, t):
     """Name drives that ask for what the loops do not allow just after the end of the run."""
-    drives = [constraint for constraint in solution.mechanism.constraints if isinstance(constraint, Drive)]
+    drives = [constraint for constraint in solution.mechanism.constraints if constraint.is_driven]
+    asked = [f"{drive.display_name}{''.join(f' of joint {joint!r}' for joint in drive.joints)}" for drive in drives]
+    told = f" The {' and the '.join(asked)} asks for what the loops do not allow after t = {float(t):.6g} s."
+    if solution.result == RESULTS.locked:
+        return told
     method, end = solution.run.tangent_space.prepared(system.dtype, solution.rank_nearby), solution.end
     small = jnp.sqrt(jnp.finfo(system.dtype).eps)
     for ahead in AHEAD * float(jnp.abs(t) + 1.0) if drives else ():
         q, _ = method.close(system, t + ahead, end.q, end.v)
         if not float(widest(configure(system, t + ahead, q))) < small:
-            asked = [f"{drive.display_name} of joint {drive.joints[0]!r}" for drive in drives]
-            return f" The {' and the '.join(asked)} asks for what the loops do not allow after t = {float(t):.6g} s."
+            return told
     return ""
 
 

@@ -22,7 +22,7 @@ import diffrax
 import equinox.internal as eqxi
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from linkax.model.topology import Topology
 from linkax.simulation.integrate.placement import Placement
@@ -35,7 +35,8 @@ class StepError(NamedTuple):
 
     - `error`: estimates of q and v, and of internal states where there are some, or None.
     - `leaves`: distance d from the nearest singular configuration where the step begins.
-    - `placement`: of its stages next to one.
+    - `placement`: of its stages next to one. `locks`: one where it leads up to where the mechanism locks, else zero; of
+      these numbers diffrax takes none for a bool.
     - `opens`: the largest gap of the loops on the way, where states between steps are read before they are corrected
       [rad, lengths of the mechanism]; None without loops.
     - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
@@ -45,16 +46,20 @@ class StepError(NamedTuple):
     error: Any
     leaves: Float[Array, ""]
     placement: Placement
+    locks: Float[Array, ""]
     opens: Float[Array, ""] | None = None
     switch: Float[Array, ""] | None = None
 
 
 class SolverState(NamedTuple):
-    """The state of the solver inside, d at the end of the last step, and the smallest d so far at any stage."""
+    """The state of the solver inside, d at the end of the last step, the smallest d so far at any stage, and whether
+    the last step led up to where the mechanism locks.
+    """
 
     inner: Any
     arrives: Float[Array, ""]
     closest: Float[Array, ""]
+    locks: Bool[Array, ""]
 
 
 def pack(
@@ -102,6 +107,12 @@ def closest(solution: diffrax.Solution) -> Float[Array, ""]:
     """The smallest d at any stage of a diffrax solution that saved the solver's state."""
     state: Any = solution.solver_state
     return state.closest
+
+
+def locked(solution: diffrax.Solution) -> Bool[Array, ""]:
+    """Whether a diffrax solution that saved the solver's state ended where the mechanism locks."""
+    state: Any = solution.solver_state
+    return state.locks & (solution.result == diffrax.RESULTS.dt_min_reached)
 
 
 _in_order = ContextVar("times_in_order", default=False)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from linkax.simulation.integrate import diffrax_contract
 from linkax.simulation.integrate.problem import derivative
 from linkax.simulation.integrate.projected_solver import ProjectedSolver
+from linkax.simulation.integrate.results import RESULTS
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.integrate.step_derivatives import (
     InitialValueProblem,
@@ -107,7 +108,9 @@ def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bo
     average = lax.stop_gradient(diffrax_contract.integral_of_distance(y_end[0]) / (t_end[0] - ivp.t0))
     closest = diffrax_contract.closest(solution)
     tracked = Steps(times[0], states[0], solution.stats["num_accepted_steps"]) if track else None
-    end = t_end[0], y_end[0], solution.stats, solution.result
+    result = RESULTS.promote(solution.result)
+    result = RESULTS.where(diffrax_contract.locked(solution), RESULTS.locked, result)
+    end = t_end[0], y_end[0], solution.stats, result
     return Integrated(ts, ys, *end, closest, average, solution.interpolation), tracked
 
 

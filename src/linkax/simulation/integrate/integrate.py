@@ -170,7 +170,6 @@ def _wrapped_event(event):
 
 def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptive: bool, rests: Any):
     """The first of what is wrong at the start, else how the integration ended."""
-    result = RESULTS.promote(result)
     if isinstance(rests, jax.Array):
         result = RESULTS.where(rests & (result == RESULTS.dt_min_reached), RESULTS.rests_on_stop, result)
     if not is_adaptive:

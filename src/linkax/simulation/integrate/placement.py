@@ -17,6 +17,9 @@ from linkax.xla.derivatives import ratio
 
 GROWTH = 2.0  # of a step after one that was cut, whose error is rounding alone
 BETTER = 2.0  # times as far from the singular configuration: what is worth another try
+LOCKED = 2e-2  # distance from a singular configuration, from which d² is straight to 0.1 in random linkages that lock
+STRAIGHT = 0.1  # of one: how far the ratios of a motion that locks may be off
+FALLS = 0.9  # the most that is left of d after a step that tells a motion that locks from one that stays beside
 
 
 class Placement(NamedTuple):
@@ -80,3 +83,30 @@ class Placement(NamedTuple):
         """Whether a try at another length is worth it; what follows counts only where the step is accepted."""
         nearest = jnp.where(keep, jnp.minimum(self.passes, self.follows), self.passes)
         return (nearest < clearance) & (self.gains > BETTER * nearest)
+
+
+def lock_ahead(
+    nodes: Float[np.ndarray, " stages"],
+    leaves: Float[Array, ""],
+    stages: Float[Array, " stages"],
+    arrives: Float[Array, ""],
+    growth: Float[Array, ""],
+) -> Float[Array, ""]:
+    """How many steps after the end of this one a driven mechanism locks, if its drives go on; zero for none.
+
+    There loops close by σ² = c (t* − t), σ the singular value that vanishes: d² falls to zero in a straight line of
+    time, and driven speeds grow like 1/d. A motion that passes, through a singular configuration or beside one, has d²
+    of a parabola, and speeds that stay bounded.
+
+    **Arguments:** as `Placement.of`; `growth`: by how much the largest speed grows in the step.
+    """
+    half = np.argmin(np.abs(nodes - 0.5))
+    middle = nodes[half].astype(leaves.dtype)
+    rise, rise_to_middle = arrives**2 - leaves**2, stages[half] ** 2 - leaves**2
+    # d² = leaves² + slope τ + curvature τ², τ in steps, whose discriminant is slope² − 4 curvature leaves².
+    curvature = (rise - rise_to_middle / middle) / (1.0 - middle)
+    slope = rise - curvature
+    is_straight = jnp.abs(4.0 * curvature * leaves**2) < STRAIGHT * slope**2
+    grows = jnp.abs(growth * arrives - leaves) < STRAIGHT * leaves
+    tells = is_straight & grows & (arrives < LOCKED) & (arrives < FALLS * leaves)
+    return jnp.where(tells, ratio(arrives**2, -rise), 0.0)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from linkax.equations.configuration import configure
+from linkax.equations.constraint_rows import constraint_rate, constraint_residual
 from linkax.equations.coordinates import on_manifold, rates, speeds
 from linkax.equations.internal_states import bound, internal_rates, num_states
 from linkax.equations.loops import widest
@@ -24,6 +25,7 @@ from linkax.simulation.integrate.switches import Sides, held, values
 from linkax.simulation.start.state import State
 from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import jit_inline
 
 # Of coordinates and speeds, as changes of both, and of internal states where there are some.
@@ -136,6 +138,15 @@ class Problem(eqx.Module):
         """The largest gap of the loops at a vector [rad, lengths of the mechanism]."""
         q = on_manifold(self.system.topology, self.unpacked(y)[0])
         return widest(configure(self.system, t, q))
+
+    @jit_inline
+    @straight_line
+    def drives_on(self, t: Float[Array, ""], y: Float[Array, " n"], ahead: Float[Array, ""]) -> Float[Array, ""]:
+        """How long drives would take at their speeds now to go as far as they go in a time ahead [s]."""
+        q, _ = self.unpacked(y)
+        asked = constraint_rate(configure(self.system, t, q))
+        asked = jnp.where(self.system.topology.slips[-len(asked) :], 0.0, asked)
+        return ratio(-(asked @ constraint_residual(configure(self.system, t + ahead, q))), asked @ asked, 0.0)
 
     def close(self, t: Float[Array, ""], y: Float[Array, " n"]) -> tuple[State, Bool[Array, ""] | bool]:
         """The `State` on the manifold to rounding, and whether it is there, on the branch that y is next to."""

@@ -14,19 +14,24 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Bool, Float
 
+from linkax.equations.constraint_rows import is_driven
 from linkax.model.numbers import Number
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import SolverState, StepError, stage_distances
-from linkax.simulation.integrate.placement import Placement
+from linkax.simulation.integrate.placement import Placement, lock_ahead
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.integrate.switches import Sides, crossed, meet
 from linkax.xla.arrays import Array
+from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import without_derivatives
 
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
 STAGNATES = 0.9  # rate at which they no longer fall
+CLOSED = 1e-5  # radians, or lengths of the mechanism: what corrections leave open at the end of a step, at most
 ON_THE_WAY = np.array([0.3, 0.6, 0.9])  # of a step: where loops are looked at
+# Times the way to where a mechanism locks: where drives are looked at, and how far they must have gone then.
+BEYOND, AT_LEAST = 1.5, 1.3
 
 
 class StageNorm(eqx.Module):
@@ -166,7 +171,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         self, terms: Any, t0: Float[Array, ""], t1: Float[Array, ""], y0: Float[Array, " n"], args: Problem
     ) -> SolverState:
         one = jnp.ones((), args.system.dtype)
-        return SolverState(self.solver.init(terms, t0, t1, y0, args), one, one)
+        return SolverState(self.solver.init(terms, t0, t1, y0, args), one, one, jnp.zeros((), bool))
 
     def func(self, terms: Any, t0: Float[Array, ""], y0: Float[Array, " n"], args: Problem) -> Float[Array, " n"]:
         return self.solver.func(terms, t0, y0, args)
@@ -198,26 +203,40 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             arrives = leaves if stages is None else stages[-1]
             errors = None if error is None else args.errors(y1, error)
         errors = jax.tree.map(lambda error: jnp.where(failed, jnp.inf, error), errors)
+        locked = jnp.zeros((), bool)
         if stages is None:
             placement = Placement.unknown(arrives)
         else:
             inner_solver: Any = self.solver
-            leaves = stages[0]
-            placement = Placement.of(
-                np.asarray(inner_solver.tableau.c, dtype=float), leaves, stages[1:], lax.stop_gradient(arrives)
-            )
+            along = np.asarray(inner_solver.tableau.c, dtype=float), stages[0], stages[1:], lax.stop_gradient(arrives)
+            leaves, placement = stages[0], Placement.of(*along)
+            if is_driven(args.system):
+                problem, t, duration, before, after = without_derivatives((args, t1, t1 - t0, y0, y1))
+                fastest = lambda y: problem.system.fastest(problem.unpacked(y)[1])
+                ahead = duration * lock_ahead(*along, ratio(fastest(after), fastest(before)))
+                locked = (ahead > 0.0) & (problem.drives_on(t, after, BEYOND * ahead) > AT_LEAST * ahead)
         closest = jnp.minimum(solver_state.closest, jnp.minimum(placement.passes, arrives))
         within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
         opens = switch = None
         if self.after_step and args.method.checks_loops(args.system.topology):
             on_the_way = t0 + jnp.asarray(ON_THE_WAY, t1.dtype) * (t1 - t0)
-            opens = lax.stop_gradient(jnp.max(jax.vmap(lambda t: args.opens(t, within(t)))(on_the_way)))
+            times = jnp.append(on_the_way, t1)
+            *between, end = jax.vmap(args.opens)(times, jnp.concatenate([jax.vmap(within)(on_the_way), y1[None]]))
+            # No motion goes on from loops that are not closed, such as past where a mechanism locks.
+            is_closed = end <= jnp.maximum(CLOSED, jnp.sqrt(jnp.finfo(end.dtype).eps))
+            opens = lax.stop_gradient(jnp.where(is_closed, jnp.max(jnp.stack(between)), jnp.inf))
         if switching:
             fixed = without_derivatives((args, t0, t1, y0, y1))
             switch, sides = lax.stop_gradient(meet(*fixed, within=within))
             _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
-        state = SolverState(inner, arrives, closest)
-        return y1, StepError(errors, leaves, placement, opens, switch), dense_info, state, result
+        state = SolverState(inner, arrives, closest, locked)
+        return (
+            y1,
+            StepError(errors, leaves, placement, locked.astype(t1.dtype), opens, switch),
+            dense_info,
+            state,
+            result,
+        )
 
     def corrected(
         self, problem: Problem, t1: Float[Array, ""], y1: Float[Array, " n"], sides: Sides

@@ -58,6 +58,10 @@ with warnings.catch_warnings():
             "A state between two steps lies off the loops, and no state that closes them is near: the steps are too "
             "long there. Ask for a smaller rtol, or take smaller steps."
         )
+        locked = (
+            "The mechanism locks: its loops do not allow what drives ask for after that. Change lengths so that it can "
+            "go on, drive another joint, or end the run before."
+        )
         rests_on_stop = (
             "The motion comes to rest on the stop of a `linkax.Impact`, after bounces that follow each other ever "
             "faster, or begins beyond it. Take a `linkax.JointLimit` or a `linkax.Contact`, which holds it, or end "
@@ -80,6 +84,7 @@ KNOWN_RESULTS = (
     "not_finite",
     "times_out_of_order",
     "off_loops",
+    "locked",
     "rests_on_stop",
     "not_reached",
 )

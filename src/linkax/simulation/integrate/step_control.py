@@ -52,6 +52,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     falls between two stages, whatever its error: that is rounding of this stage. So is one that ends where the next one
     could not be placed, see `linkax.simulation.integrate.placement`. A step that goes past a switch of a force element
     is tried again up to there, see `linkax.simulation.integrate.switches`; the next one is as long as it was before.
+    After a step that leads up to where the mechanism locks there is none.
 
     - `is_undifferentiated`: see `ProjectedSolver`.
     """
@@ -147,11 +148,13 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         # Controllers around the innermost one have times of their own to end steps at.
         longer = jnp.maximum(next_t1, next_t0 + free) if self.controller is self.innermost else next_t1
         next_t1 = jnp.where(again, end, longer)
-        next_t0 = jnp.where(keep & jnp.logical_not(again), next_t0, t0)
+        ends = keep & jnp.logical_not(again)
+        result = diffrax.RESULTS.where(ends & (y_error.locks > 0.0), diffrax.RESULTS.dt_min_reached, result)
+        next_t0 = jnp.where(ends, next_t0, t0)
         next_t1, free = self._until_known(args, next_t0, next_t1, jnp.where(again, free, 0.0))
         either = lambda retry, otherwise: jax.tree.map(lambda a, b: jnp.where(again, a, b), retry, otherwise)
         return (
-            keep & jnp.logical_not(again),
+            ends,
             next_t0,
             next_t1,
             jump & jnp.logical_not(again),

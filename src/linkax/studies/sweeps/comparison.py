@@ -36,6 +36,7 @@ INSTANT = 1e-6  # duration of the run that compiles, relative to the whole
 LONG_RUN = 0.5  # a run that takes longer is timed once [s]
 STOPPED = {
     "dt_min_reached": "the step size fell to nothing",
+    "locked": "the mechanism locks",
     "max_steps_reached": "out of steps",
     "diverged": "numbers were no longer finite",
 }

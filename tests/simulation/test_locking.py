@@ -1,0 +1,88 @@
+"""Driven mechanisms that lock end there, soon and by name, and those that turn back before, or just pass, go on."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mechanisms import crank_slider, four_bar
+
+import linkax as lx
+from linkax.simulation.integrate.placement import lock_ahead
+
+NODES = np.array([0.25, 0.5, 0.75, 1.0])
+PRESETS = {"draft": lx.DRAFT, "balanced": lx.BALANCED, "precise": lx.PRECISE}
+END = diffrax.SaveAt(t1=True)
+CRANK, ROD = 0.5, 0.4
+LOCKS = float(np.arcsin(ROD / CRANK))  # where the rod of a longer crank stands across its slide
+
+
+def sample(distance):
+    """d where a step begins, at its stages, and where it ends."""
+    return distance(0.0), distance(NODES), distance(1.0)
+
+
+@pytest.mark.parametrize("time", [1.1, 1.5, 3.0])
+def test_d_squared_on_a_straight_line_locks(time):
+    """With speeds that grow like 1/d; one that passes, at the distance `least`, does not, at whatever speed."""
+    begin, stages, end = sample(lambda t: 0.02 * np.sqrt(1.0 - t / time))
+    np.testing.assert_allclose(lock_ahead(NODES, begin, stages, end, begin / end), time - 1.0, rtol=1e-9)
+    assert lock_ahead(NODES, begin, stages, end, jnp.asarray(1.0)) == 0.0
+    for least in (0.0, 1e-4, 1e-2):
+        begin, stages, end = sample(lambda t, least=least: np.sqrt(least**2 + (0.02 * (1.0 - t / time)) ** 2))
+        for growth in (1.0, begin / end):
+            assert lock_ahead(NODES, begin, stages, end, jnp.asarray(growth)) == 0.0
+
+
+def driven(turning):
+    """A crank-slider whose crank is longer than its rod, driven by an angle."""
+    mechanism = crank_slider(crank=CRANK, rod=ROD, constraints=[lx.Drive("motor", "bearing", turning)])
+    return mechanism, lx.assemble(mechanism, guess={"guide": 0.8})
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_run_ends_where_its_mechanism_locks(preset):
+    mechanism, start = driven(lambda t: 3.0 * t)
+    with pytest.raises(lx.SimulationError, match=r"locks.*drive 'motor' of joint 'bearing' asks for what the") as error:
+        lx.simulate(mechanism, start, t1=2.0, saveat=END, accuracy=PRESETS[preset])
+    run = error.value.solution
+    assert run.result == lx.RESULTS.locked
+    np.testing.assert_allclose(run.t_end, LOCKS / 3.0, rtol=1e-3)
+    assert run.stats["num_steps"] < 60
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("margin", [1e-3, 1e-5, 1e-7])
+def test_a_drive_that_turns_back_before_does_not_lock(preset, margin):
+    """At full speed: distances are square roots of margins."""
+    highest = LOCKS - margin
+    mechanism, start = driven(lx.PiecewiseLinear([0.0, 0.3, 0.6], [0.0, highest, 0.0]))
+    run = lx.simulate(mechanism, start, t1=0.6, saveat=diffrax.SaveAt(ts=[0.3, 0.6]), accuracy=PRESETS[preset])
+    np.testing.assert_allclose(run.joint("bearing"), [highest, 0.0], atol=1e-9)
+    np.testing.assert_allclose(run.joint("guide")[1], CRANK + ROD, atol=1e-6)
+
+
+def test_members_that_lock_hold_up_no_sweep():
+    """They take little more steps than others, and have the result of a run alone."""
+
+    def run(lengths):
+        crank, coupler, rocker = lengths
+        drive = lx.Drive("motor", "crank_bearing", speed=4.0)
+        mechanism = four_bar(crank=crank, coupler=coupler, rocker=rocker, ground=1.0, constraints=[drive])
+        start = lx.assemble(mechanism, guess={"crank_pin": 0.5, "rocker_bearing": 1.5})
+        return lx.simulate(mechanism, start, t1=2.0, saveat=END, throw=False)
+
+    lengths = np.random.default_rng(0).uniform([0.15, 0.5, 0.5], [0.5, 1.2, 1.2], (64, 3))
+    crank, coupler, rocker = lengths.T
+    found = jax.jit(jax.vmap(run))(lengths)
+    # The crank turns all the way round where it and any other link are no longer than the other two (Grashof).
+    spans = np.stack([np.ones(64), crank, coupler, rocker])
+    turns = (2.0 * (spans.min(axis=0) + spans.max(axis=0)) <= spans.sum(axis=0)) & (crank <= spans.min(axis=0))
+    assembles = (1.0 - crank < coupler + rocker) & (np.abs(coupler - rocker) < 1.0 - crank)
+    steps, locks = np.asarray(found.stats["num_steps"]), np.asarray(found.result == lx.RESULTS.locked)
+    assert 8 < np.sum(turns) < 56
+    np.testing.assert_array_equal(found.result == lx.RESULTS.successful, turns & assembles)
+    np.testing.assert_array_equal(found.result == lx.RESULTS.not_assembled, ~assembles)
+    np.testing.assert_array_equal(locks, assembles & ~turns)
+    assert np.max(steps) <= 2 * np.max(steps[turns & assembles])
+    assert run(lengths[np.argmax(locks)]).result == lx.RESULTS.locked
