@@ -178,6 +178,21 @@ def test_a_mimic_follows_the_axis_that_it_names(tmp_path):
         four_bar(tmp_path, more=extra_link("wheel", follows.format("crank_bearing")))
 
 
+LEADERS = [pytest.param(name, marks=pytest.mark.slow) for name in ("crank_bearing", "crank_pin", "rocker_bearing")]
+
+
+@pytest.mark.parametrize("leader", ["rocker_pin", *LEADERS])
+def test_a_mimic_follows_any_joint_of_a_loop(leader, tmp_path):
+    """That of the joint where the loop would be cut, too."""
+    mimic = f'<mimic joint="{leader}"><multiplier>2</multiplier><offset>0.3</offset><reference>0.1</reference></mimic>'
+    follows = extra_link("wheel", f"<axis><xyz>0 1 0</xyz>{mimic}</axis>")
+    mechanism = four_bar(tmp_path, more=follows).mechanism()
+    start = lx.assemble(mechanism, speeds={"crank_bearing": 3.0})
+    run = lx.simulate(mechanism, start, t1=0.3)
+    assert np.ptp(run.joint(leader)) > 0.1
+    np.testing.assert_allclose(run.joint("wheel_bearing"), 2.0 * (run.joint(leader) - 0.1) + 0.3, atol=1e-9)
+
+
 def test_poses_are_relative_to_frames(tmp_path):
     more = """<frame name="top" attached_to="crank"><pose>0 0 1 0 0 0</pose></frame>
     <link name="tip"><pose relative_to="top" degrees="true">0.5 0 0 0 0 90</pose></link>
