@@ -180,3 +180,16 @@ def test_switches_that_are_no_number(switch):
     mechanism = pendulum(forces=[Bad(jnp.array(1.0))])
     with pytest.raises(ValueError, match="Bad: its switch"):
         lx.simulate(mechanism, lx.assemble(mechanism), t1=1.0)
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_load_that_pushes_back_from_both_sides_is_named(told):
+    """A weight comes to rest by dry friction, whose side a switch tells or nothing does."""
+    weight = lx.point_mass("weight", 1.0)
+    dry = lx.JointTorque("slide", lambda t, motion: -3.0 * jnp.sign(motion.joint_speed("slide")))
+    forces = [Friction(jnp.array(3.0)) if told else dry]
+    mechanism = lx.Mechanism([weight], [lx.Prismatic("slide", lx.GROUND, weight, "x")], forces)
+    options = {"t1": 1.0, "saveat": SAVE_END, "max_steps": 1024}
+    with pytest.raises(lx.SimulationError, match=r"load of .* jumps there, by 6; .* linkax.JointFriction") as error:
+        lx.simulate(mechanism, lx.State(jnp.zeros(1), jnp.ones(1)), **options)
+    np.testing.assert_allclose(error.value.solution.t_end, 1.0 / 3.0, rtol=1e-4)

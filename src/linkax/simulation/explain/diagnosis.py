@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from linkax.equations.configuration import configure
 from linkax.equations.constraint_rows import constraint_gamma, constraint_rate, constraint_residual
+from linkax.equations.coordinates import retract
 from linkax.equations.dynamics import mass_matrix
 from linkax.equations.gaps import gaps
 from linkax.equations.internal_states import bound
@@ -29,6 +30,9 @@ from linkax.xla.derivatives import ratio
 AHEAD = 10.0 ** np.arange(-14, 0)  # of the time of the run: how far ahead of its end a cause is looked for
 OPEN_ULPS = 1e3  # that loops are open where constraints contradict each other
 LOST = 1e-9  # of an inertia: what is below leaves too few digits of double precision
+# Shares of coordinates and speeds over which a load changes by the same where it jumps, and of itself by so much.
+JUMPS = 1e-6, 1e-7
+SEEN = 1e-3
 NULL = 1e-10  # eigenvalue of a mass matrix of ones
 
 
@@ -54,6 +58,7 @@ def cause(solution: Solution) -> str:
     return (
         _no_acceleration(solution, system, method, t)
         or _exhausted(solution, system, t)
+        or _jumps(solution, system, t)
         or _drives(solution, system, t)
         or _ahead(solution, system, t)
         or _contradiction(solution, system, t)
@@ -126,6 +131,35 @@ def _exhausted(solution, system, t):
     configuration = configure(system, t, solution.end.q)
     told = [said for force in solution.mechanism.forces if (said := force.exhausted(configuration))]
     return f" {told[0]}" if told else ""
+
+
+def _jumps(solution, system, t):
+    """Name a force element whose load jumps where the run ends: it may push back from both sides."""
+    end, begin = solution.end, solution.run.state
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (2, system.topology.num_speeds))
+    speed = jnp.maximum(system.fastest(end.v), system.fastest(begin.v))
+
+    def loads(change):
+        """Of all force elements a little ahead in a direction where any coordinate and speed may rise or fall."""
+        q = retract(system.topology, end.q, change * signs[0] * system.scales)
+        at = configure(bound(system, end.internal), jnp.asarray(t), q)
+        motion = move(at, end.v + change * speed * signs[1] * system.scales)
+        of = lambda force: jnp.concatenate([*map(jnp.ravel, force.applied(jnp.asarray(t), motion))])
+        return jnp.stack([of(force) for force in motion.system.forces])
+
+    if not system.forces or not bool(jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v))):
+        return ""
+    apart = lambda change: np.max(np.abs(loads(change) - loads(-change)), axis=1, initial=0.0)
+    wide, narrow = map(apart, JUMPS)
+    sizes = np.max(np.abs(loads(JUMPS[0])), axis=1, initial=0.0)
+    jumping = np.flatnonzero((narrow > wide / 2.0) & (narrow > SEEN * sizes))
+    if not len(jumping):
+        return ""
+    name = solution.mechanism.forces[jumping[0]].display_name
+    return (
+        f" The load of {name} jumps there, by {narrow[jumping[0]]:.3g}; where it pushes back from both sides no step "
+        "leads on. Let it change over a small speed or distance, as linkax.JointFriction does."
+    )
 
 
 def _drives(solution, system, t):
