@@ -38,7 +38,7 @@ class StepError(NamedTuple):
     - `placement`: of its stages next to one. `locks`: one where it leads up to where the mechanism locks, else zero; of
       these numbers diffrax takes none for a bool.
     - `opens`: the largest gap of the loops on the way, where states between steps are read before they are corrected
-      [rad, lengths of the mechanism]; None without loops.
+      [rad, lengths of the mechanism], at its end as many times that as less is allowed there; None without loops.
     - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
       past, one for none; None where there are none.
     """

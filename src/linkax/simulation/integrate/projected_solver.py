@@ -20,7 +20,7 @@ from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import SolverState, StepError, stage_distances
 from linkax.simulation.integrate.placement import Placement, lock_ahead
 from linkax.simulation.integrate.problem import Problem
-from linkax.simulation.integrate.step_control import MechanismControl
+from linkax.simulation.integrate.step_control import OPENS, MechanismControl
 from linkax.simulation.integrate.switches import Sides, crossed, meet
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
@@ -223,20 +223,15 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             times = jnp.append(on_the_way, t1)
             *between, end = jax.vmap(args.opens)(times, jnp.concatenate([jax.vmap(within)(on_the_way), y1[None]]))
             # No motion goes on from loops that are not closed, such as past where a mechanism locks.
-            is_closed = end <= jnp.maximum(CLOSED, jnp.sqrt(jnp.finfo(end.dtype).eps))
-            opens = lax.stop_gradient(jnp.where(is_closed, jnp.max(jnp.stack(between)), jnp.inf))
+            at_most = jnp.maximum(CLOSED, jnp.sqrt(jnp.finfo(end.dtype).eps))
+            opens = lax.stop_gradient(jnp.max(jnp.stack([*between, OPENS / at_most * end])))
         if switching:
             fixed = without_derivatives((args, t0, t1, y0, y1))
             switch, sides = lax.stop_gradient(meet(*fixed, within=within))
             _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
         state = SolverState(inner, arrives, closest, locked)
-        return (
-            y1,
-            StepError(errors, leaves, placement, locked.astype(t1.dtype), opens, switch),
-            dense_info,
-            state,
-            result,
-        )
+        of_step = StepError(errors, leaves, placement, locked.astype(t1.dtype), opens, switch)
+        return y1, of_step, dense_info, state, result
 
     def corrected(
         self, problem: Problem, t1: Float[Array, ""], y1: Float[Array, " n"], sides: Sides
