@@ -17,27 +17,21 @@ GROWS = 1e-6  # |Re λ| / |λ| up to which a motion neither grows nor decays
 
 EQUAL_ULPS = 100.0  # distance between eigenvalues, in what rounding moves them by, up to which they are equal
 
-_eig = one_by_one(lambda matrix: tuple(jnp.linalg.eig(matrix)))
+_eig = one_by_one(lambda matrix: tuple(lax.linalg.eig(matrix, compute_left_eigenvectors=True)))
 
 
 def _spectrum(matrix):
     """Eigenvalues and eigenvectors of a matrix, differentiable to any order; derivatives of equal ones are NaN."""
-    found = _eigenpairs(matrix)
+    *found, left = _eigenpairs(matrix)
     if not len(matrix):
-        return found
-    equal = _equal_another(*lax.stop_gradient((matrix, *found)))
-    return undefined_where((equal, equal), found, matrix)
+        return tuple(found)
+    equal = _equal_another(*lax.stop_gradient((matrix, *found, left)))
+    return undefined_where((equal, equal), tuple(found), matrix)
 
 
-def _left(matrix, values):
-    """Left eigenvectors, as columns."""
-    found, left = _eigenpairs(matrix.T)
-    return left[:, jnp.argmin(jnp.abs(values[:, None] - found[None, :]), axis=1)]
-
-
-def _equal_another(matrix, values, vectors):
+def _equal_another(matrix, values, vectors, left):
     """Whether each eigenvalue is as close to another as rounding of the largest moves it, by ε |λ| / |wᵀ v|."""
-    along = jnp.abs(jnp.sum(_left(matrix, values) * vectors, axis=0))  # of unit vectors
+    along = jnp.abs(jnp.sum(left * vectors, axis=0))  # of unit vectors
     apart = jnp.abs(values[:, None] - values[None, :]) + jnp.diag(jnp.full(len(values), jnp.inf, matrix.dtype))
     rounding = EQUAL_ULPS * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(values))
     # No quotient: of a double zero both sides are zero.
@@ -46,28 +40,36 @@ def _equal_another(matrix, values, vectors):
 
 @jax.custom_jvp
 def _eigenpairs(matrix):
-    return _eig(matrix)
+    """Eigenvalues λ, and right and left eigenvectors A v = λ v, wᵀ A = λ wᵀ, as columns."""
+    values, left, vectors = _eig(matrix)
+    return values, vectors, left.conj()
 
 
 @_eigenpairs.defjvp
 def _eigenpairs_jvp(primals, tangents):
-    """Of each eigenvalue λ by itself: (A − λ) v̇ − λ̇ v = −Ȧ v and wᵀ v̇ = 0, w its left eigenvector.
+    """Of each eigenvalue λ by itself: (A − λ) v̇ − λ̇ v = −Ȧ v and wᵀ v̇ = 0.
 
     That has one solution whatever the others are, such as a double zero, whose eigenvectors are parallel.
     """
     (matrix,), (change,) = primals, tangents
-    values, vectors = _eigenpairs(matrix)
+    values, vectors, left = _eigenpairs(matrix)
+    equal = _equal_another(matrix, values, vectors, left)
     unit = jnp.eye(len(values) + 1, dtype=values.dtype)
 
-    def slopes(each):
-        value, vector, left, equal = each
-        shifted = matrix - value * unit[1:, 1:]
-        bordered = jnp.block([[shifted, -vector[:, None]], [left[None], jnp.zeros((1, 1), values.dtype)]])
-        right = jnp.pad(change.astype(values.dtype) @ vector, (0, 1))
-        return -jnp.linalg.solve(jnp.where(equal, unit, bordered), right)
+    def slopes(matrix, change, vectors, left):
+        def of_one(each):
+            value, vector, left, equal = each
+            shifted = matrix - value * unit[1:, 1:]
+            bordered = jnp.block([[shifted, -vector[:, None]], [left[None], jnp.zeros((1, 1), values.dtype)]])
+            right = jnp.pad(change.astype(values.dtype) @ vector, (0, 1))
+            return -jnp.linalg.solve(jnp.where(equal, unit, bordered), right)
 
-    found = lax.map(slopes, (values, vectors.T, _left(matrix, values).T, _equal_another(matrix, values, vectors)))
-    return (values, vectors), (found[:, -1], found[:, :-1].T)
+        found = lax.map(of_one, (values, vectors.T, left.T, equal))
+        return found[:, -1], found[:, :-1].T
+
+    to_values, to_vectors = slopes(matrix, change, vectors, left)
+    _, to_left = slopes(matrix.T, change.T, left, vectors)
+    return (values, vectors, left), (to_values, to_vectors, to_left)
 
 
 def _table(found: "Linearisation") -> Table:
