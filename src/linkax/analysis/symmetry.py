@@ -5,28 +5,38 @@ the linearised equations along each of them. A motion with v = X(q) is a relativ
 Introduction to Mechanics and Symmetry, 1999.
 """
 
-from typing import Any
+from collections.abc import Callable
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from linkax.equations.configuration import configure
-from linkax.equations.coordinates import carried, coordinates_by_speed, on_manifold, rates, retract
+from linkax.equations.coordinates import (
+    coordinates,
+    coordinates_by_speed,
+    quaternion_places,
+    retract,
+    speeds,
+    turn_rate,
+)
 from linkax.equations.system import System
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.joints.free import Free
 from linkax.model.topology import GROUND_INDEX, Topology
-from linkax.spatial.quaternions import rotation_matrix
+from linkax.spatial.quaternions import from_rotation_matrix, rotation_matrix
 from linkax.spatial.vectors import cross
 from linkax.xla.arrays import Array
 from linkax.xla.batches import one_by_one
 from linkax.xla.derivatives import positive_or_one
 
 BESIDE = 0.01  # how far beside a motion its symmetries are sought [rad, lengths of the mechanism, shares of its speed]
+
+SQUARINGS, POWERS = 10, 12  # by which exponentials are exact to rounding for turns of 100 rad
 
 _inverted = one_by_one(lambda matrix: jnp.linalg.pinv(matrix, rtol=jnp.finfo(matrix.dtype).eps ** 0.5))
 
@@ -63,7 +73,7 @@ class Symmetry(eqx.Module):
         """The one of constant speeds v."""
         topology = system.topology
         sliding = configure(system, t, q).sliding
-        fixed = np.isin(np.arange(len(v)), np.concatenate([[], *_ground_slides(topology)]))
+        fixed = np.isin(np.arange(len(v)), np.concatenate([[], *(columns for columns, _ in _turning_slides(topology))]))
         axes = jnp.where(fixed[:, None], jnp.zeros((len(v), 3), v.dtype).at[topology.motions[:, 1]].set(sliding), 0.0)
         return Symmetry(topology, axes, v, jnp.zeros(num_turns(topology), v.dtype))
 
@@ -79,82 +89,85 @@ class Symmetry(eqx.Module):
 
         And to each quaternion those of an angular velocity, to a `Free` joint of a velocity too, in axes of the child.
         """
-        speeds, places, start = jnp.asarray(self.constant), coordinates_by_speed(self.topology, q), 0
-        for columns in _ground_slides(self.topology):
-            velocity = cross(self.turns[start : start + 3], places[columns] @ self.axes[columns])
-            speeds, start = speeds.at[columns].add(self.axes[columns] @ velocity), start + 3
-        for in_q, columns in _turning(self.topology):
-            vectors = self.turns[start : start + len(columns)].reshape(-1, 3)
-            of_child = vectors @ rotation_matrix(q[in_q : in_q + 4]).T
-            speeds, start = speeds.at[columns].add(of_child.ravel()), start + len(columns)
-        return speeds
+        return self.along(q, jnp.zeros_like(self.constant))[0]
 
     def along(
         self, q: Float[Array, " n_q"], v: Float[Array, " n_v"]
     ) -> tuple[Float[Array, " n_v"], Float[Array, " n_v"]]:
         """X at q, and its rate at speeds v."""
-        return _with_rate(lambda s: self.speeds(retract(self.topology, q, s * v)), v.dtype)
+        in_q, in_v = quaternion_places(self.topology)
+        axes = rotation_matrix(q[in_q])
+        speeds = self.constant + self._of_turns(coordinates_by_speed(self.topology, q), axes)
+        return speeds, self._of_turns(v, _turned(v[in_v], axes))
+
+    def _of_turns(self, places, axes):
+        """F p, linear in coordinates of slides, (n_v,), and rotation matrices of quaternions, (n, 3, 3)."""
+        speeds = jnp.zeros_like(places)
+        for columns, in_turns in _turning_slides(self.topology):
+            fixed, turn = self.axes[columns], self.turns[in_turns]
+            speeds = speeds.at[columns].add(fixed @ cross(turn, places[columns] @ fixed))
+        for (columns, in_turns), of_child in zip(_turning_quaternions(self.topology), axes, strict=True):
+            vectors = self.turns[in_turns].reshape(-1, 3) @ of_child.T
+            speeds = speeds.at[columns].add(vectors.ravel())
+        return speeds
 
     def carry(self, q: Float[Array, " n_q"], change: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
         """The rate of a small change of q that goes along."""
         speeds, rate = self.along(q, change)
-        return rate + _turn(self.topology, speeds, change)
+        return rate + turn_rate(self.topology, speeds, change)
 
     def follow(
         self, q: Float[Array, " n_q"], changes: Float[Array, "n_v k"], duration: Float[Array, ""]
     ) -> tuple[Float[Array, " n_q"], Float[Array, "n_v k"]]:
-        """Coordinates and small changes of them after a time [s]."""
+        """Coordinates and small changes of them after a time [s].
+
+        X is linear in coordinates of slides and in rotation matrices R of quaternions, Ṙ = c × R + R (p ×).
+        """
         topology = self.topology
-
-        def of_each(function):
-            return jax.vmap(function, in_axes=1, out_axes=1)
-
         if not len(self.turns):
-            motion = duration * self.constant
-            return retract(topology, q, motion), of_each(lambda change: carried(topology, motion, change))(changes)
+            return q + duration * self.constant, changes
+        in_q, in_v = quaternion_places(topology)
+        in_turns = [within[:3] for _, within in _turning_quaternions(topology)]
+        of_parent, of_child = self.constant[in_v], self.turns[np.array(in_turns, int).reshape(-1, 3)]
 
-        def flow(_, state, __):
-            q, changes = state
-            carry = of_each(lambda change: self.carry(q, change))
-            return duration * rates(topology, q, self.speeds(q)), duration * carry(changes)
+        def unfolded(q):
+            return ravel_pytree((coordinates_by_speed(topology, q), rotation_matrix(q[in_q]), jnp.ones((), q.dtype)))
 
-        error = float(jnp.finfo(q.dtype).eps) ** (2 / 3)
-        found: Any = diffrax.diffeqsolve(
-            diffrax.ODETerm(flow),
-            diffrax.Dopri8(),
-            t0=0.0,
-            t1=1.0,
-            dt0=None,
-            y0=(q, changes),
-            stepsize_controller=diffrax.PIDController(rtol=error, atol=error),
-            throw=False,
-        )
-        q, changes = (of_end[-1] for of_end in found.ys)
-        return on_manifold(topology, q), changes
+        flat, restored = unfolded(q)
+
+        def rates(flat):
+            places, axes, one = restored(flat)
+            turning = _turned(of_parent, axes) - _turned(of_child, axes.mT).mT
+            return ravel_pytree((one * self.constant + self._of_turns(places, axes), turning, jnp.zeros_like(one)))[0]
+
+        flow = _exponential(duration * jax.jacfwd(rates)(jnp.zeros_like(flat)))
+
+        def after(change):
+            places, axes, _ = restored(flow @ unfolded(retract(topology, q, change))[0])
+            return coordinates(topology, places, from_rotation_matrix(axes))
+
+        q, follow = jax.linearize(after, jnp.zeros_like(self.constant))
+        return q, jax.vmap(lambda change: speeds(topology, q, follow(change)), in_axes=1, out_axes=1)(changes)
 
     def misses(
         self,
-        system: System,
-        method: TangentSpace,
-        t: Float[Array, ""],
         q: Float[Array, " n_q"],
         v: Float[Array, " n_v"],
+        acceleration: Float[Array, " n_v"],
+        change_acceleration: Callable[..., Float[Array, " n_v"]],
     ) -> Float[Array, " n_v"]:
-        """By how much X misses the linearised equations along the motion through a state; zero for a symmetry."""
-        v, acceleration, q, _ = method.derivative(system, t, q, v, True)
+        """By how much X misses the linearised equations along the motion through a state; zero for a symmetry.
+
+        `change_acceleration`: how the acceleration changes with small changes of time, q and v.
+        """
 
         def change(s):
             at, moved = retract(self.topology, q, s * v), v + s * acceleration
             speeds, rate = self.along(at, moved)
-            return speeds, rate - _turn(self.topology, moved, speeds)
+            return speeds, rate - turn_rate(self.topology, moved, speeds)
 
-        (of_places, of_speeds), (_, needed) = _with_rate(change, v.dtype)
-
-        def beside(s):
-            at = retract(self.topology, q, s * of_places), v + s * of_speeds
-            return method.derivative(system, t + s, *at, True)[1]
-
-        return needed - _with_rate(beside, v.dtype)[1]
+        changes, (_, needed) = _with_rate(change, v.dtype)
+        return needed - change_acceleration(jnp.ones((), v.dtype), *changes)
 
 
 def find_turns(
@@ -170,31 +183,42 @@ def find_turns(
 
     **Arguments:** `constant`: the motion, without any; `places`, `speeds`: directions in which q and v may change.
     """
-    v = constant.speeds(q)
+    v, topology, count = constant.speeds(q), system.topology, len(constant.turns)
     pace, scales = positive_or_one(system.fastest(v)), system.scales
-    acceleration = method.derivative(system, t, q, v, True)[1]
-    unit = lambda columns: BESIDE * columns / positive_or_one(jax.vmap(system.fastest, in_axes=1)(columns))
-    changes = jnp.concatenate([unit(places), jnp.zeros_like(speeds)], axis=1).T
-    moved = v + pace * jnp.concatenate([jnp.zeros_like(places), unit(speeds)], axis=1).T
+    unit = lambda columns: BESIDE * (columns / positive_or_one(jax.vmap(system.fastest, in_axes=1)(columns))).T
+    own, still = jnp.zeros((1, len(v)), v.dtype), jnp.zeros_like(v)
+    changes = jnp.concatenate([own, unit(places), jnp.zeros_like(speeds.T)])
+    moved = v + pace * jnp.concatenate([own, jnp.zeros_like(places.T), unit(speeds)])
 
-    def missed(turns):
-        symmetry = constant.turning(q, pace * turns)
-        of_state = lambda change, v: symmetry.misses(system, method, t, retract(system.topology, q, change), v)
-        own = (acceleration - symmetry.along(q, v)[1]) / pace
-        return (jnp.concatenate([own[None], jax.vmap(of_state)(changes, moved)]) / (scales * pace**2)).ravel()
+    def missed(state):
+        """By how much each X misses the acceleration, and the linearised equations."""
+        change, v = state
+        near, v, _, _ = method.correct(system, t, retract(topology, q, change), v)
+        (v, acceleration, at), follow = jax.linearize(
+            lambda s, place, v: method.derivative(system, t + s, retract(topology, near, place), v, True)[:3],
+            *(jnp.zeros_like(t), still, v),
+        )
 
-    count = len(constant.turns)
-    each = jax.vmap(missed, out_axes=1)(jnp.eye(count + 1, count, -1, dtype=v.dtype))
+        def of_turns(turns):
+            symmetry = constant.turning(q, pace * turns)
+            accelerates = (acceleration - symmetry.along(at, v)[1]) / pace
+            misses = symmetry.misses(at, v, acceleration, lambda *changes: follow(*changes)[1])
+            return jnp.stack([accelerates, misses / pace**2]) / scales
+
+        return jax.vmap(of_turns)(jnp.eye(count + 1, count, -1, dtype=v.dtype))
+
+    of_all = lax.map(missed, (changes, moved))
+    each = jnp.concatenate([of_all[:1, :, 0], of_all[:, :, 1]]).transpose(0, 2, 1).reshape(-1, count + 1)
     return -pace * _pseudo_inverse(each[:, 1:] - each[:, :1]) @ each[:, 0]
 
 
 def num_turns(topology: Topology) -> int:
     """m."""
-    return 3 * len(_ground_slides(topology)) + sum(len(columns) for _, columns in _turning(topology))
+    return sum(len(in_turns) for _, in_turns in _turning_slides(topology) + _turning_quaternions(topology))
 
 
-def _ground_slides(topology):
-    """Indices in v of slides whose axes are fixed on the ground, by the tree that they carry; no less than two each."""
+def _turning_slides(topology):
+    """Indices in v of slides whose axes are fixed on the ground, by the tree that they carry, two or more; and in p."""
     found, fixed = {}, {GROUND_INDEX}
     for body, kind in enumerate(topology.joint_types[: topology.num_bodies]):
         if topology.predecessor[body] in fixed and isinstance(kind, type) and not topology.reversed[body]:
@@ -203,23 +227,31 @@ def _ground_slides(topology):
             found.setdefault(topology.root[body], []).extend(columns[slides])
             if np.all(slides):
                 fixed.add(body)
-    return [np.array(columns) for columns in found.values() if len(columns) > 1]
+    several = [np.array(columns) for columns in found.values() if len(columns) > 1]
+    return [(columns, 3 * tree + np.arange(3)) for tree, columns in enumerate(several)]
 
 
-def _turning(topology):
-    """Where each quaternion begins in q, and its indices in v, with those of the velocity of a `Free` joint."""
+def _turning_quaternions(topology):
+    """Indices in v of each quaternion's angular velocity, and of the velocity of a `Free` joint; and in p."""
     kinds = [kind for kind in topology.joint_types[: topology.num_bodies] if kind.has_quaternion]
-    return [
-        (in_q, in_v + np.arange(6 if kind is Free else 3))
-        for (in_q, in_v), kind in zip(topology.quaternions, kinds, strict=True)
-    ]
+    sizes = [6 if kind is Free else 3 for kind in kinds]
+    begins = 3 * len(_turning_slides(topology)) + np.cumsum([0, *sizes])
+    each = zip(topology.quaternions[:, 1], begins, sizes, strict=False)
+    return [(in_v + np.arange(size), begin + np.arange(size)) for in_v, begin, size in each]
 
 
-def _turn(topology, v, change):
-    """The rate of a small change of q that quaternions take along at speeds v."""
-    if not len(topology.quaternions):
-        return jnp.zeros_like(change)
-    return _with_rate(lambda s: carried(topology, s * v, change), v.dtype)[1]
+def _turned(turn, axes):
+    """a × R for turns a, (n, 3), and matrices R, (n, 3, 3)."""
+    return cross(turn[:, None], axes.mT).mT
+
+
+def _exponential(matrix):
+    """exp A by its power series for A / 2ⁿ, see Moler and Van Loan, SIAM Review 45 (2003)."""
+    term = total = jnp.eye(len(matrix), dtype=matrix.dtype)
+    for power in range(1, POWERS):
+        term = term @ matrix / (2.0**SQUARINGS * power)
+        total = total + term
+    return lax.fori_loop(0, SQUARINGS, lambda _, root: root @ root, total)
 
 
 def _with_rate(function, dtype):

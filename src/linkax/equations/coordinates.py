@@ -7,17 +7,17 @@ angular velocity is in axes of the parent.
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from linkax.model.topology import Topology
-from linkax.spatial.quaternions import conjugate, from_rotation_vector, multiply, normalised, rotation_matrix
-from linkax.spatial.rotations import rotate
+from linkax.spatial.quaternions import conjugate, from_rotation_vector, multiply, normalised
+from linkax.spatial.vectors import cross
 from linkax.xla.arrays import Array
 from linkax.xla.static_scatter import scatter_static
 
 
-def _places(topology):
-    """Indices of quaternions in q, (n, 4), and of their angular velocities in v, (n, 3)."""
+def quaternion_places(topology: Topology) -> tuple[Int[np.ndarray, "n 4"], Int[np.ndarray, "n 3"]]:
+    """Indices of quaternions in q, and of their angular velocities in v."""
     starts = topology.quaternions
     return starts[:, :1] + np.arange(4), starts[:, 1:] + np.arange(3)
 
@@ -38,25 +38,24 @@ def retract(topology: Topology, q: Float[Array, " n_q"], change: Float[Array, " 
     """Add a finite change (n_v,) to coordinates: q ⊕ δ."""
     if not len(topology.quaternions):
         return q + change
-    in_q, in_v = _places(topology)
+    in_q, in_v = quaternion_places(topology)
     turned = normalised(multiply(from_rotation_vector(change[in_v]), q[in_q]))
     return scatter_static(q + _of_plain(topology, change), in_q, turned)
 
 
-def carried(topology: Topology, motion: Float[Array, " n_v"], change: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
-    """Carry a small change of q along to q ⊕ motion, (n_v,) each: quaternions turn it."""
+def turn_rate(topology: Topology, v: Float[Array, " n_v"], change: Float[Array, " n_v"]) -> Float[Array, " n_v"]:
+    """The rate of a small change of q that is carried along at speeds v: quaternions turn it, by ω × δ."""
     if not len(topology.quaternions):
-        return change
-    _, in_v = _places(topology)
-    turn = rotation_matrix(from_rotation_vector(motion[in_v]))
-    return scatter_static(change, in_v, rotate(turn, change[in_v]))
+        return jnp.zeros_like(change)
+    _, in_v = quaternion_places(topology)
+    return scatter_static(jnp.zeros_like(change), in_v, cross(v[in_v], change[in_v]))
 
 
 def on_manifold(topology: Topology, q: Float[Array, " n_q"]) -> Float[Array, " n_q"]:
     """Normalise the quaternions."""
     if not len(topology.quaternions):
         return q
-    in_q, _ = _places(topology)
+    in_q, _ = quaternion_places(topology)
     return scatter_static(q, in_q, normalised(q[in_q]))
 
 
@@ -64,7 +63,7 @@ def rates(topology: Topology, q: Float[Array, " n_q"], v: Float[Array, " n_v"]) 
     """q̇ at speeds v."""
     if not len(topology.quaternions):
         return v
-    in_q, in_v = _places(topology)
+    in_q, in_v = quaternion_places(topology)
     return scatter_static(_of_plain(topology, v), in_q, _quaternion_rates(q[in_q], v[in_v]))
 
 
@@ -83,9 +82,17 @@ def speeds(topology: Topology, q: Float[Array, " n_q"], rates: Float[Array, " n_
     """The speeds v with rates q̇; small changes of q likewise."""
     if not len(topology.quaternions):
         return rates
-    in_q, in_v = _places(topology)
+    in_q, in_v = quaternion_places(topology)
     omega = 2.0 * multiply(rates[in_q], conjugate(q[in_q]))[:, 1:]
     return scatter_static(coordinates_by_speed(topology, rates), in_v, omega)
+
+
+def coordinates(
+    topology: Topology, by_speed: Float[Array, " n_v"], quaternions: Float[Array, "n 4"]
+) -> Float[Array, " n_q"]:
+    """Coordinates q of those by speed, see `coordinates_by_speed`, and of quaternions."""
+    plain = _of_plain(topology, by_speed)
+    return scatter_static(plain, quaternion_places(topology)[0], quaternions) if len(topology.quaternions) else plain
 
 
 def coordinates_by_speed(topology: Topology, q: Float[Array, " n_q"]) -> Float[Array, " n_v"]:
