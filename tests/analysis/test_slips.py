@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from mechanisms import rolling_disc, sleigh, steady_spin
 from scipy import interpolate
+from scipy.spatial.transform import Rotation
 
 import linkax as lx
+from linkax.equations.coordinates import retract
+from linkax.equations.system import system_of
+from linkax.spatial.quaternions import rotation_matrix
 
 G = 9.81
 
@@ -184,3 +188,85 @@ def test_a_bicycle_that_rolls():
     value, slope = near(beside, capsize)
     inverse = interpolate.KroghInterpolator(np.repeat(value, 2), np.stack([beside, 1.0 / slope], axis=1).ravel())
     np.testing.assert_allclose(inverse(0.0), 6.02426201538837, atol=1e-8)
+
+
+@jax.jit
+def moving_bicycle(q, v):
+    """What turns about the vertical, shifts and the wheels' angles do not change, and its rates; slopes of both.
+
+    That is the axle's slope, the steering angle, the rates of both, and that of the rear wheel. And accelerations.
+    """
+    mechanism = bicycle()
+    method, system = lx.TangentSpace().prepared(float), system_of(mechanism, float)
+
+    def at(change):
+        place, speed = jnp.split(change, 2)
+        on_ground = retract(mechanism.topology, q, place)
+        moved, acceleration, on_ground, _ = method.derivative(system, jnp.zeros(()), on_ground, v + speed, True)
+        axle = rotation_matrix(on_ground[:4])[:, 1]
+        turns = jnp.cross(moved[:3], axle)
+        tips = (jnp.cross(acceleration[:3], axle) + jnp.cross(moved[:3], turns))[2]
+        rates = jnp.stack([turns[2], moved[7]]), jnp.stack([tips, *acceleration[jnp.array([7, 6])]])
+        reduced = jnp.stack([axle[2], on_ground[8]]), rates[0], moved[6:7]
+        return (jnp.concatenate(reduced), jnp.concatenate(rates)), (on_ground, moved, acceleration)
+
+    still = jnp.zeros(2 * len(v))
+    slopes, _ = jax.jacfwd(at, has_aux=True)(still)
+    return *at(still), slopes
+
+
+@pytest.mark.slow
+def test_accelerations_of_a_bicycle_anywhere():
+    """Basu-Mandal, Chatterjee and Papadopoulos, Proc. R. Soc. A 463 (2007), table 1, by two sets of equations.
+
+    The frame is turned by angles θ, ψ and φ about z, x and z, which is the axle; straight, it heads along −x.
+    """
+    psi, phi, steer, height = 0.9501292851472, 3.1257073014894, 0.2311385135743, 0.2440472102925
+    velocity = np.array([-2.8069345714545, -0.1480982396001, 0.1058778746261])
+    rates = np.array([0.7830033527065, 0.6068425835418, -0.0119185528069])
+    of_joints = [8.9129896614890, 0.4859824687093, 8.0133620584155]  # rear wheel, steering, front wheel
+    turned = Rotation.from_euler("ZXZ", [0.0, psi, phi]).as_matrix()
+    frame = turned @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    lines = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], turned[:, 2]])  # the axes of the angles
+    omega, down = rates @ lines, frame @ [0.0, 0.0, -0.3]
+    turn = Rotation.from_matrix(frame).as_quat(scalar_first=True)
+    q = np.array([*turn, *(down + np.array([0.0, 0.0, height])), 0.0, steer, 0.0])
+    v = np.array([*omega, *(velocity + np.cross(omega, down)), *of_joints])
+    _, (_, moved, found), _ = moving_bicycle(q, v)
+    np.testing.assert_allclose(moved, v, atol=1e-11)
+    np.testing.assert_allclose(found[6:], [1.8472554144217, -4.6198904039403, 2.4548072904550], atol=1e-10)
+    second = np.array([0.8353281706379, -7.8555281128244, 0.1205543897884])
+    carried = np.cross(rates[0] * lines[0], rates[1] * lines[1]) + np.cross(rates[:2] @ lines[:2], rates[2] * lines[2])
+    np.testing.assert_allclose(found[:3], second @ lines + carried, atol=1e-10)
+    of_axle = found[3:6] - np.cross(found[:3], down) - np.cross(omega, np.cross(omega, down))
+    np.testing.assert_allclose(of_axle, [-0.5041626315047, -0.3449706619454, -1.4604528332980], atol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_bicycle_that_turns():
+    """Hands-free in circles, as its accelerations say, reduced along the symmetry; wherever it is, and heads to.
+
+    Place and heading turn with it: a place has ±i Ω. Zeros are of the heading, the wheels, and another circle.
+    """
+    mechanism, speed = bicycle(), 5.9
+    q, v = np.eye(10)[0], np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0, speed / 0.3, 0.0, speed / 0.35])
+    for slope in (0.05, 0.2, 0.4):
+        for _ in range(12):
+            (reduced, rates), (q, v, _), slopes = moving_bicycle(q, v)
+            off = np.array([reduced[0] - slope, *rates[:4]])
+            step = np.linalg.lstsq(np.concatenate([slopes[0][:1], slopes[1][:4]]), -off, rcond=1e-10)[0]
+            q, v = retract(mechanism.topology, q, step[:9]), v + step[9:]
+        np.testing.assert_allclose(off, 0.0, atol=1e-11)
+        matrix = slopes[1] @ np.linalg.pinv(slopes[0], rcond=1e-9)
+        np.testing.assert_allclose(matrix @ slopes[0], slopes[1], atol=1e-9)  # nothing else matters
+        exact = np.append(np.linalg.eigvals(matrix), [1j * v[2], -1j * v[2]])
+        found = lx.linearise(mechanism, lx.State(q, v)).eigenvalues
+        assert found.shape == (10,)
+        assert np.sum(np.abs(found) < 1e-4) == 4
+        np.testing.assert_allclose(nearest(found, exact), 0.0, atol=1e-7)
+        heading = Rotation.from_euler("z", 2.0)
+        turn = (heading * Rotation.from_quat(q[:4], scalar_first=True)).as_quat(scalar_first=True)
+        place, *twist = heading.apply(np.array([q[4:7], v[:3], v[3:6]]))
+        place = place + np.array([30.0, -20.0, 0.0])
+        there = lx.State(np.concatenate([turn, place, q[7:]]), np.concatenate([*twist, v[6:]]))
+        np.testing.assert_allclose(nearest(lx.linearise(mechanism, there).eigenvalues, exact), 0.0, atol=1e-7)

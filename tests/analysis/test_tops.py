@@ -31,7 +31,10 @@ def in_gimbals(*axes):
 
 @pytest.mark.slow
 def test_a_sleeping_top():
-    """A λ² − i C ω λ = m g l of its tilt as a complex number: stable for (C ω)² > 4 A m g l. From the body at λ − i ω."""
+    """A λ² − i C ω λ = m g l of its tilt as a complex number, stable for (C ω)² > 4 A m g l.
+
+    Seen from the body that is λ − i ω.
+    """
     critical = np.sqrt(4.0 * ACROSS * WEIGHT) / AXIAL
     ball, gimbals = on_a_ball(), in_gimbals("x", "y", "z")
     for spin in (0.9 * critical, 1.1 * critical):
