@@ -22,11 +22,11 @@ _eig = one_by_one(lambda matrix: tuple(lax.linalg.eig(matrix, compute_left_eigen
 
 def _spectrum(matrix):
     """Eigenvalues and eigenvectors of a matrix, differentiable to any order; derivatives of equal ones are NaN."""
-    *found, left = _eigenpairs(matrix)
+    values, vectors, left = _eigenpairs(matrix)
     if not len(matrix):
-        return tuple(found)
-    equal = _equal_another(*lax.stop_gradient((matrix, *found, left)))
-    return undefined_where((equal, equal), tuple(found), matrix)
+        return values, vectors
+    equal = _equal_another(*map(lax.stop_gradient, (matrix, values, vectors, left)))
+    return undefined_where((equal, equal), (values, vectors), matrix)
 
 
 def _equal_another(matrix, values, vectors, left):

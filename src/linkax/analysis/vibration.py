@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import ArrayLike
+from jaxtyping import ArrayLike, Int
 
 from linkax.analysis.linearisation import EQUAL_ULPS, Linearisation, StateSlopes, gyroscopic_frequencies, state_matrix
 from linkax.analysis.moving import Moving
@@ -23,6 +23,7 @@ from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.spatial.vectors import largest
+from linkax.xla.arrays import Array
 from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, concrete
 from linkax.xla.undefined import undefined_where
@@ -111,7 +112,7 @@ def _turns(mechanism, state, t, count):
 
 
 @Program
-def _linearise(mechanism, state, t, count, moves, turns):
+def _linearise(mechanism, state, t, count, moves, turns) -> tuple[Linearisation, Steadiness, Int[Array, ""]]:
     """A `Linearisation`, its `Steadiness`, along the first of `turns`, (k, m), that has a steady motion, or the first.
 
     And the degrees of freedom counted at the state.
