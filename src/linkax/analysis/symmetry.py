@@ -5,14 +5,13 @@ the linearised equations along each of them. A motion with v = X(q) is a relativ
 Introduction to Mechanics and Symmetry, 1999.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import block_diag
 from jaxtyping import Float
 
 from linkax.equations.configuration import configure
@@ -149,26 +148,6 @@ class Symmetry(eqx.Module):
         q, follow = jax.linearize(after, jnp.zeros_like(self.constant))
         return q, jax.vmap(lambda change: speeds(topology, q, follow(change)), in_axes=1, out_axes=1)(changes)
 
-    def misses(
-        self,
-        q: Float[Array, " n_q"],
-        v: Float[Array, " n_v"],
-        acceleration: Float[Array, " n_v"],
-        change_acceleration: Callable[..., Float[Array, " n_v"]],
-    ) -> Float[Array, " n_v"]:
-        """By how much X misses the linearised equations along the motion through a state; zero for a symmetry.
-
-        `change_acceleration`: how the acceleration changes with small changes of time, q and v.
-        """
-
-        def change(s):
-            at, moved = retract(self.topology, q, s * v), v + s * acceleration
-            speeds, rate = self.along(at, moved)
-            return speeds, rate - turn_rate(self.topology, moved, speeds)
-
-        changes, (_, needed) = _with_rate(change, v.dtype)
-        return needed - change_acceleration(jnp.ones((), v.dtype), *changes)
-
 
 def find_turns(
     constant: Symmetry,
@@ -183,31 +162,39 @@ def find_turns(
 
     **Arguments:** `constant`: the motion, without any; `places`, `speeds`: directions in which q and v may change.
     """
-    v, topology, count = constant.speeds(q), system.topology, len(constant.turns)
-    pace, scales = positive_or_one(system.fastest(v)), system.scales
-    unit = lambda columns: BESIDE * (columns / positive_or_one(jax.vmap(system.fastest, in_axes=1)(columns))).T
-    own, still = jnp.zeros((1, len(v)), v.dtype), jnp.zeros_like(v)
-    changes = jnp.concatenate([own, unit(places), jnp.zeros_like(speeds.T)])
-    moved = v + pace * jnp.concatenate([own, jnp.zeros_like(places.T), unit(speeds)])
+    motion, topology, count = constant.speeds(q), system.topology, len(constant.turns)
+    pace, scales = positive_or_one(system.fastest(motion)), system.scales
+    nothing, one = jnp.zeros((), motion.dtype), jnp.ones((), motion.dtype)
 
-    def missed(state):
-        """By how much each X misses the acceleration, and the linearised equations."""
-        change, v = state
-        near, v, _, _ = method.correct(system, t, retract(topology, q, change), v)
+    def unit(columns):
+        return BESIDE * (columns / positive_or_one(jax.vmap(system.fastest, in_axes=1)(columns))).T
+
+    def missed(beside):
+        """By how much each X misses the acceleration of a state, and the linearised equations along its motion."""
+        in_q, in_v = jnp.split(beside, 2)
+        near, v, _, _ = method.correct(system, t, retract(topology, q, in_q), motion + in_v)
         (v, acceleration, at), follow = jax.linearize(
-            lambda s, place, v: method.derivative(system, t + s, retract(topology, near, place), v, True)[:3],
-            *(jnp.zeros_like(t), still, v),
+            lambda s, change, v: method.derivative(system, t + s, retract(topology, near, change), v, True)[:3],
+            *(nothing, jnp.zeros_like(v), v),
         )
 
         def of_turns(turns):
             symmetry = constant.turning(q, pace * turns)
+
+            def later(s):
+                """X as a change of q, and of v."""
+                speeds = v + s * acceleration
+                change, rate = symmetry.along(retract(topology, at, s * v), speeds)
+                return change, rate - turn_rate(topology, speeds, change)
+
+            changes, (_, needed) = jax.jvp(later, (nothing,), (one,))
             accelerates = (acceleration - symmetry.along(at, v)[1]) / pace
-            misses = symmetry.misses(at, v, acceleration, lambda *changes: follow(*changes)[1])
-            return jnp.stack([accelerates, misses / pace**2]) / scales
+            return jnp.stack([accelerates, (needed - follow(one, *changes)[1]) / pace**2]) / scales
 
         return jax.vmap(of_turns)(jnp.eye(count + 1, count, -1, dtype=v.dtype))
 
-    of_all = lax.map(missed, (changes, moved))
+    # The motion itself comes first.
+    of_all = lax.map(missed, jnp.pad(block_diag(unit(places), pace * unit(speeds)), ((1, 0), (0, 0))))
     each = jnp.concatenate([of_all[:1, :, 0], of_all[:, :, 1]]).transpose(0, 2, 1).reshape(-1, count + 1)
     return -pace * _pseudo_inverse(each[:, 1:] - each[:, :1]) @ each[:, 0]
 
@@ -252,8 +239,3 @@ def _exponential(matrix):
         term = term @ matrix / (2.0**SQUARINGS * power)
         total = total + term
     return lax.fori_loop(0, SQUARINGS, lambda _, root: root @ root, total)
-
-
-def _with_rate(function, dtype):
-    """A function of a number at zero, and its derivative."""
-    return jax.jvp(function, (jnp.zeros((), dtype),), (jnp.ones((), dtype),))
