@@ -104,6 +104,25 @@ def test_discs_that_roll_upright_and_in_circles():
 
 
 @pytest.mark.slow
+def test_a_disc_on_slides_and_in_gimbals():
+    """It rolls in a circle as one whose joint is free does."""
+    tilt, turning = 0.35, 1.8
+    spin = steady_spin(tilt, turning)
+    free, state = rolling_disc(tilt, turning, spin)
+    (disc,) = free.bodies
+    kinds = [lx.Prismatic, lx.Prismatic, lx.Prismatic, lx.Revolute, lx.Revolute, lx.Revolute]
+    rings = [lx.RigidBody(f"ring {index}", 0.0, inertia=[0.0, 0.0, 0.0]) for index in range(5)]
+    pairs = zip(kinds, [lx.GROUND, *rings], [*rings, disc], "xyzzyz", strict=True)
+    joints = [kind(f"to {child.name}", parent, child, axis) for kind, parent, child, axis in pairs]
+    gimballed = lx.Mechanism([*rings, disc], joints, free.forces, free.constraints)
+    place = np.array([*state.q[4:], 0.0, tilt - np.pi / 2.0, 0.0])
+    found = lx.linearise(gimballed, lx.State(place, np.array([*state.v[3:], turning, 0.0, spin]))).eigenvalues
+    exact = [*lx.linearise(free, state).eigenvalues]
+    assert np.sum(np.abs(found) < 1e-4) == 4
+    np.testing.assert_allclose(nearest(found, [each for each in exact if abs(each) > 1e-4]), 0.0, atol=1e-8)
+
+
+@pytest.mark.slow
 def test_what_does_not_roll_steadily_is_refused():
     tilt, turning = 0.35, 1.8
     mechanism, state = rolling_disc(tilt, turning, 1.1 * steady_spin(tilt, turning))
