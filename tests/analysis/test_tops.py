@@ -47,6 +47,9 @@ def test_a_sleeping_top():
             np.testing.assert_allclose(nearest(found, exact), 0.0, atol=1e-6)
             np.testing.assert_allclose(nearest(exact, found), 0.0, atol=1e-6)
         assert (np.max(still.real) > 1e-3) == (spin < critical)
+    single = lx.linearise(ball, lx.State(*(jnp.asarray(part, jnp.float32) for part in (upright.q, upright.v))))
+    assert single.stiffness.dtype == jnp.float32
+    np.testing.assert_allclose(nearest(single.eigenvalues, turning), 0.0, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ class Nearby(eqx.Module):
 
 def instants(system: System, v: Float[Array, " n_v"]) -> Float[Array, " k"]:
     """The times that the fastest joint needs at speeds v to go as far as `LATER` says [s]."""
-    return ratio(LATER, lax.stop_gradient(system.fastest(v)), 0.0)
+    return ratio(jnp.asarray(LATER, v.dtype), lax.stop_gradient(system.fastest(v)), 0.0)
 
 
 def widest_gap(system: System, t: Float[Array, ""], q: Float[Array, " n_q"]) -> Float[Array, ""]:

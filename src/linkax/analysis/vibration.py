@@ -51,7 +51,8 @@ def linearise(
     **Raises:** `ValueError` for a state that is neither in equilibrium nor in steady motion. Inside JAX transformations
     nothing is raised, and the numbers are NaN.
     """
-    state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
+    state = checked_state(mechanism, state)
+    t = jnp.asarray(checked_time(t, "t"), state.q.dtype)
     if degrees_of_freedom is None:
         rank = concrete(_rank(mechanism, state, t))
         if rank is None:
