@@ -24,12 +24,12 @@ from linkax.studies.fits.fit_search import (
     search_from_each,
     sensitivity,
 )
-from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt
+from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt, LinearModel
 from linkax.studies.laboratory.experiments import Experiment
 from linkax.studies.laboratory.laboratory import FITTED, Laboratory
 from linkax.studies.parameters.free_parameters import NEAREST, FreeParameters
 from linkax.studies.parameters.parameters import as_arrays
-from linkax.studies.parameters.uncertainty import DEPENDENT, NO_INFLUENCE, uncertainty
+from linkax.studies.parameters.uncertainty import NO_INFLUENCE, uncertainty
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import compiling
 
@@ -44,12 +44,15 @@ SETTLED_ENDS = "converged", "stopped early"
 AT_END = 1e-4  # of the range between bounds, up to which a number is on one, of a loss
 SETTLED = 1e-2  # relative change of the noise of sensors, from which on it stays as it is found
 ROUNDS = 10  # of finding it
+FAR = 0.1  # from a minimum, in standard errors, up to which a search may have converged
 DEFAULT_RATE = 0.02  # of Adam, in parameters that all start near one
 NO_MINIMUM = {
     "at an edge": "the loss would fall further where the function is not finite, as where no state can be assembled; "
     "start elsewhere, keep parameters in `linkax.Bounded`, or look whether the model can give these data",
     "no derivative": "the function is finite at these parameters, and its derivative is not, as that of a square root "
     "at zero; start elsewhere, or write it such that it has one",
+    "no better step": "the loss has a slope where it ended, as where the function has a kink, a run is inaccurate, or "
+    "tolerances of an optimiser are large beside the residual; try a tighter accuracy, or another start",
 }
 
 
@@ -85,8 +88,8 @@ def fit(
       `optax.adam`.
     - `steps`: largest number of steps; by default 100 for a residual, 1000 for a loss; of all searches together, where
       the noise of sensors is found, which takes several.
-    - `tolerance`: relative change of parameters and residual at which Levenberg-Marquardt ends; relative gain of the
-      loss from which a step of optax counts as a gain.
+    - `tolerance`: part of the residual that a further step should take away, at which Levenberg-Marquardt ends;
+      relative gain of the loss from which a step of optax counts as a gain.
     - `patience`: number of steps without gain after which the fit ends; by default unlimited.
     - `mode`: "forward" or "reverse" mode of derivatives; by default forward for a residual, and for a loss the cheaper
       one by the number of parameters.
@@ -103,8 +106,8 @@ def fit(
     finite or has no derivative where the fit starts; and for a checkpoint of another fit.
 
     **Warns:** of parameters that the data do not determine, or whose best value lies beyond a bound, where the fit
-    ended at an edge or without derivative, of noise of sensors that does not settle, and of channels that the model
-    does not explain.
+    ended at an edge, without derivative or without a better step, of noise of sensors that does not settle, and of
+    channels that the model does not explain.
     """
     kinds = Callable | Experiment | list | tuple
     require_type(
@@ -214,7 +217,7 @@ def _search_by(optimiser, function, free, mode, is_loss, tolerance) -> AbstractS
     if mode not in (None, "forward", "reverse"):
         raise ValueError(f"mode is {mode!r}; give 'forward', 'reverse', or None")
     if optimiser is None:
-        optimiser = optax.adam(DEFAULT_RATE) if is_loss else LevenbergMarquardt(tolerance, tolerance, free)
+        optimiser = optax.adam(DEFAULT_RATE) if is_loss else LevenbergMarquardt(tolerance, free)
     by_squares = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
     if not by_squares:
         known_ones = "give one of optax, such as optax.adam(1e-2), or a least-squares solver of optimistix"
@@ -227,8 +230,8 @@ def _search_by(optimiser, function, free, mode, is_loss, tolerance) -> AbstractS
 def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> Fit:
     """The `Fit` of a residual, with covariance where the search may have ended in a minimum."""
     residual, slopes = (np.asarray(part) for part in sensitivity(search, z, args))
-    if ended == "converged" and _is_at_edge(search, z, args, residual, slopes, tolerance):
-        ended = "at an edge"
+    if ended == "converged":
+        ended = _checked_end(search, z, args, residual, slopes, tolerance)
     gradient, pulled = slopes.T @ residual, _beyond_bounds(search.free, z, residual, slopes)
     loss, count, scatter = float(0.5 * residual @ residual), len(residual) - search.free.num_priors, None
     there, factors = np.ones(len(residual), bool), np.ones(len(residual))
@@ -334,14 +337,22 @@ def check_output(shape: Any, what: str) -> None:
         )
 
 
-def _is_at_edge(search, z, args, residual, slopes, tolerance) -> bool:
-    """Whether an undamped step within bounds that should lower the loss leads to where the function is not finite."""
-    slopes = np.where(_beyond_bounds(search.free, z, residual, slopes), 0.0, slopes)
-    low, high = map(np.asarray, search.free.room(z))
-    step = np.clip(-np.linalg.lstsq(slopes, residual, rcond=DEPENDENT)[0], low, high)
-    left = residual + slopes @ step
-    gains = residual @ residual - left @ left > max(tolerance, np.finfo(float).eps) * (residual @ residual)
-    return bool(gains and not np.all(np.isfinite(sensitivity(search, z + step, args)[0])))
+@eqx.filter_jit
+def _undamped(model):
+    return model.undamped()
+
+
+def _checked_end(search, z, args, residual, slopes, tolerance) -> str:
+    """How a search ended that says it has converged, by what an undamped step should gain and where it leads."""
+    model = LinearModel.at(z, residual, slopes, search.free)
+    step, gain = _undamped(model)
+    loss = 0.5 * residual @ residual
+    if gain <= max(tolerance, np.finfo(float).eps) * loss + model.rounding():
+        return "converged"
+    if not np.all(np.isfinite(sensitivity(search, z + step, args)[0])):
+        return "at an edge"
+    variance = 2.0 * loss / max(len(residual) - len(z), 1)
+    return "no better step" if 2.0 * gain > FAR**2 * variance else "converged"
 
 
 def _check_ending(steps, tolerance, patience):

@@ -92,9 +92,9 @@ class Fit(NamedTuple):
       without priors and missing samples; None for a loss.
     - `names`: of the p numbers in `params`, in the order of `covariance`.
     - `covariance`: of these numbers, (p, p), estimated from the sensitivities of the residual and its size. Infinite
-      for numbers that the data do not determine; None for a loss, and where the fit ended at an edge or without
-      derivative. `noise`: standard deviation of the residual, None likewise; of experiments in units of the noise that
-      sensors give, or that was found.
+      for numbers that the data do not determine; None for a loss, and where the fit ended at an edge, without
+      derivative or without a better step. `noise`: standard deviation of the residual, None likewise; of experiments in
+      units of the noise that sensors give, or that was found.
     - `undetermined`: names of the numbers that the data do not determine.
     - `on_bound`: {name: "lower" or "upper"} of the numbers that lie on a bound, beyond which the loss would fall
       further, or, of a loss, within 1e-4 of the range from it. They have no standard error: their covariance is NaN,
@@ -103,7 +103,7 @@ class Fit(NamedTuple):
     - `history`: {"loss": at each step, where noise is found in units of that found so far}. `steps`: number of steps.
     - `ended`: "converged", "stopped early", "diverged", or "out of steps"; "at an edge", where the loss would fall
       further but the function is not finite there; "no derivative", where the function is finite and its derivative is
-      not.
+      not; "no better step", where it ended although the loss has a slope.
     - `spread`: level of confidence -> ends of the intervals; None where `covariance` is.
     - `experiments`: those that were fitted, none for a function. `noises`: {channel: standard deviation} of what their
       sensors tell, where these do not give it.

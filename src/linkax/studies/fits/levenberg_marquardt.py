@@ -1,4 +1,4 @@
-"""The method of Levenberg and Marquardt, built on optimistix, with damping that does not depend on units."""
+"""The method of Levenberg and Marquardt, built on optimistix, whose steps and whose end do not depend on units."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -6,85 +6,130 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import ArrayLike, Bool, Float
 
 from linkax.studies.parameters.free_parameters import FreeParameters
 from linkax.studies.parameters.uncertainty import NO_INFLUENCE
+from linkax.xla.arrays import Array
 
 FIRST_DAMPING = 1e-2
 LEAST_DAMPING = 1e-12
 HIGHER, LOWER = 2.0, 5.0
 ENOUGH = 0.25  # gain of a step, relative to the predicted one, above which the next is damped less
-NOTHING = 1e-2  # gain that is not worth a step, relative to rtol
+EXACT = 1e-11  # change of a free number that is rounding
+TURNS = 3  # for each parameter, in which the best step within bounds is found
 
 
-class DescentState(NamedTuple):
-    """What steps from one place are computed from, in units of `sizes`.
+class LinearModel(NamedTuple):
+    """The residual near some z, as a linear function of the step from there.
 
-    - `matrix`, `rest`: of fewer rows than the Jacobian and the residual, with the same products.
-    - `low`, `high`: least and largest step. `largest`: norms so far of the columns of the Jacobian.
+    - `slopes`, `residual`: of fewer rows than the Jacobian and the residual, with the same products.
+    - `sizes`: units of the free numbers, as one over each. `low`, `high`: least and largest step.
     """
 
-    matrix: Float[Array, "k p"]
-    rest: Float[Array, " k"]
+    slopes: Float[Array, "k p"]
+    residual: Float[Array, " k"]
     sizes: Float[Array, " p"]
     low: Float[Array, " p"]
     high: Float[Array, " p"]
-    largest: Float[Array, " p"]
+
+    @staticmethod
+    def at(
+        z: Float[Array, " p"], residual: Float[Array, " n"], slopes: Float[Array, "n p"], free: FreeParameters
+    ) -> "LinearModel":
+        """With the norms of the columns of the Jacobian as `sizes`."""
+        turn, triangle = jnp.linalg.qr(slopes)
+        low, high = map(jnp.asarray, free.room(z))
+        return LinearModel(triangle, turn.T @ residual, jnp.linalg.norm(triangle, axis=0), low, high)
+
+    def step(self, damping: ArrayLike) -> Float[Array, " p"]:
+        """−(Jᵀ J + λ D²)⁻¹ Jᵀ r, with λ the damping and D the `sizes`; within the room, the best step there is."""
+        # Parameters without influence, whose slopes are rounding, stay as they are.
+        matters = self.sizes > NO_INFLUENCE * jnp.max(self.sizes)
+        sizes = jnp.where(matters, self.sizes, 1.0)
+        matrix = jnp.where(matters, self.slopes / sizes, 0.0)
+        return least_squares_within(matrix, self.residual, damping, self.low * sizes, self.high * sizes) / sizes
+
+    def undamped(self) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+        """The step that should gain most, and by how much it should lower the loss.
+
+        The units are those of the slopes here: those of a place before may be so much larger that they damp it.
+        """
+        step = self._replace(sizes=jnp.linalg.norm(self.slopes, axis=0)).step(LEAST_DAMPING)
+        left = self.residual + self.slopes @ step
+        return step, 0.5 * (self.residual @ self.residual - left @ left)
+
+    def rounding(self) -> Float[Array, ""]:
+        """The loss that rounding may leave of data without noise."""
+        sizes = jnp.linalg.norm(self.slopes, axis=0)
+        least = jnp.min(jnp.where(sizes >= NO_INFLUENCE * jnp.max(sizes), sizes, jnp.inf))
+        return 0.5 * (EXACT * least) ** 2
 
 
-# The state of `_DelayedDamping`.
-SearchState = tuple[Float[Array, ""], Bool[Array, ""]]
+def least_squares_within(
+    matrix: Float[Array, "k p"],
+    residual: Float[Array, " k"],
+    damping: ArrayLike,
+    low: Float[Array, " p"],
+    high: Float[Array, " p"],
+) -> Float[Array, " p"]:
+    """The x between `low` and `high`, around zero, that minimises |matrix x + residual|² + damping |x|².
+
+    By active sets: on the way from zero to the best x, entries are held where they meet a bound, and one is let go
+    where that lowers the sum (Stark and Parker, Bounded-variable least-squares: an algorithm and applications, 1995).
+    """
+    index = jnp.arange(len(low))
+
+    def best(held, x):
+        left, values, right = jnp.linalg.svd(jnp.where(held, 0.0, matrix), full_matrices=False)
+        rest = left.T @ (residual + matrix @ jnp.where(held, x, 0.0))
+        return jnp.where(held, x, -right.T @ (rest * values / (values**2 + damping)))
+
+    def turn(found):
+        x, held, _, count = found
+        way = best(held, x) - x
+        ends = jnp.where(way < 0.0, low, high)
+        parts = jnp.where(held | (way == 0.0), jnp.inf, (ends - x) / way)
+        part, met = jnp.min(parts), (index == jnp.argmin(parts)) & (jnp.min(parts) < 1.0)
+        x = jnp.where(met, ends, x + jnp.minimum(part, 1.0) * way)
+        slope = matrix.T @ (residual + matrix @ x) + damping * x
+        inwards = jnp.where(held, jnp.where(x <= low, -slope, slope), 0.0)
+        freed = (index == jnp.argmax(inwards)) & (inwards > 0.0) & (part >= 1.0)
+        return x, (held | met) & ~freed, jnp.any(met | freed), count + 1
+
+    begin = jnp.zeros_like(low), jnp.zeros(low.shape, bool), jnp.array(True), 0
+    return lax.while_loop(lambda found: found[2] & (found[3] < TURNS * len(low)), turn, begin)[0]
 
 
 class _ScaledDescent(optx.AbstractDescent):
-    """Steps −(Jᵀ J + λ D²)⁻¹ Jᵀ r, with λ one over the step size, D the largest norms so far of the columns of J.
+    """Steps of the `LinearModel`, with the largest norms so far of the columns of the Jacobian as `sizes`.
 
     optimistix damps by λ alone, which is too much for parameters and residuals of some magnitudes, and nothing for
     others. (Moré, The Levenberg-Marquardt algorithm, 1978, section 6, says why D must not fall.)
-
-    Where a step would leave the room that there is, it ends there for the parameter that is furthest out, and is the
-    best one for the others, until all are within.
     """
 
     free: FreeParameters
 
-    def init(self, y: Float[Array, " p"], f_info_struct: Any) -> DescentState:
+    def init(self, y: Float[Array, " p"], f_info_struct: Any) -> LinearModel:
         none = jnp.zeros(min(len(y), f_info_struct.residual.shape[0]), y.dtype)
-        return DescentState(jnp.outer(none, y), none, *4 * (jnp.zeros_like(y),))
+        return LinearModel(jnp.outer(none, jnp.asarray(y)), none, *3 * (jnp.zeros_like(y),))
 
-    def query(self, y: Float[Array, " p"], f_info: Any, state: DescentState) -> DescentState:
-        slopes = f_info.jac.as_matrix()
-        norms = jnp.linalg.norm(slopes, axis=0)
+    def query(self, y: Float[Array, " p"], f_info: Any, state: LinearModel) -> LinearModel:
+        found = LinearModel.at(y, f_info.residual, f_info.jac.as_matrix(), self.free)
         # Those of logarithms fall with the parameter.
-        largest = jnp.where(jnp.isfinite(self.free.longest), norms, jnp.maximum(state.largest, norms))
-        # Parameters without influence, whose slopes are rounding, stay as they are.
-        matters = largest > NO_INFLUENCE * jnp.max(largest)
-        sizes = jnp.where(matters, largest, 1.0)
-        left, values, right = jnp.linalg.svd(jnp.where(matters, slopes / sizes, 0.0), full_matrices=False)
-        low, high = map(jnp.asarray, self.free.room(y))
-        found = values[:, None] * right, left.T @ f_info.residual, sizes, low * sizes, high * sizes
-        return DescentState(*found, largest)
+        largest = jnp.where(jnp.isfinite(self.free.longest), found.sizes, jnp.maximum(state.sizes, found.sizes))
+        return found._replace(sizes=largest)
 
-    def step(self, step_size: Float[Array, ""], state: DescentState) -> tuple[Float[Array, " p"], optx.RESULTS]:
-        def best(held, step):
-            left, values, right = jnp.linalg.svd(jnp.where(held, 0.0, state.matrix), full_matrices=False)
-            rest = left.T @ (state.rest + state.matrix @ jnp.where(held, step, 0.0))
-            return jnp.where(held, step, -right.T @ (rest * values / (values**2 + 1.0 / step_size)))
+    def step(self, step_size: Float[Array, ""], state: LinearModel) -> tuple[Float[Array, " p"], optx.RESULTS]:
+        return state.step(1.0 / step_size), optx.RESULTS.successful
 
-        def overshoot(step):
-            """How much too long the step is for each parameter."""
-            return jnp.maximum(step - state.high, state.low - step) / state.sizes
 
-        def within(found):
-            held, step = found
-            held = held | (jnp.arange(len(step)) == jnp.argmax(jnp.where(held, 0.0, overshoot(step))))
-            return held, best(held, jnp.clip(step, state.low, state.high))
+class SearchState(NamedTuple):
+    """- `damping`: λ. `failed`: whether the step did. `rough`: whether it did so since the function is rough."""
 
-        none = jnp.zeros(state.low.shape, bool)
-        begin = none, best(none, jnp.zeros_like(state.low))
-        _, step = lax.while_loop(lambda found: jnp.any(~found[0] & (overshoot(found[1]) > 0.0)), within, begin)
-        return step / state.sizes, optx.RESULTS.successful
+    damping: Float[Array, ""]
+    failed: Bool[Array, ""]
+    rough: Bool[Array, ""]
 
 
 class _DelayedDamping(optx.AbstractSearch):
@@ -92,18 +137,13 @@ class _DelayedDamping(optx.AbstractSearch):
 
     Along a narrow valley, where long steps fail, this takes the fewest steps (Transtrum, Sethna, Improvements to the
     Levenberg-Marquardt algorithm for nonlinear least-squares minimization, 2012).
-
-    The state is λ, and whether no further step can gain more than `rtol` of the loss.
-
-    A step that has to end early for want of `room` tells nothing of those that follow: where an exponential is small,
-    a rising one gains little.
     """
 
     rtol: int | float
     free: FreeParameters
 
     def init(self, y: Float[Array, " p"], f_info_struct: Any) -> SearchState:
-        return jnp.asarray(FIRST_DAMPING, y.dtype), jnp.zeros((), bool)
+        return SearchState(jnp.asarray(FIRST_DAMPING, y.dtype), *2 * (jnp.zeros((), bool),))
 
     def step(
         self,
@@ -114,26 +154,28 @@ class _DelayedDamping(optx.AbstractSearch):
         f_eval_info: Any,
         state: SearchState,
     ) -> tuple[Float[Array, ""], Bool[Array, ""], optx.RESULTS, SearchState]:
-        damping, _ = state
         before, after = f_info.as_min(), f_eval_info.as_min()
         expected = -optx.ClassicalTrustRegion().predict_reduction(y_eval - y, f_info)
         gained = before - after
         accept = first_step | (gained > 0.0)
-        less = jnp.where(gained > ENOUGH * expected, damping / LOWER, damping)
-        changed = jnp.where(accept, less, damping * HIGHER)
-        # A step that fails although little was expected shows the noise of the function.
-        enough = jnp.where(gained > 0.0, NOTHING * self.rtol, self.rtol)
-        cut = jnp.any(y_eval - y > 0.5 * self.free.longest)
-        idle = jnp.logical_not(first_step | cut) & (jnp.abs(expected) <= enough * before)
-        damping = jnp.maximum(jnp.where(first_step, damping, changed), LEAST_DAMPING)
-        return 1.0 / damping, accept, optx.RESULTS.successful, (damping, idle)
+        less = jnp.where(gained > ENOUGH * expected, state.damping / LOWER, state.damping)
+        changed = jnp.where(accept, less, state.damping * HIGHER)
+        damping = jnp.maximum(jnp.where(first_step, state.damping, changed), LEAST_DAMPING)
+        # A step that fails is the function's roughness where it is but rounding, or where little was expected, and no
+        # more was lost, unless it led to where the function is not finite.
+        little = self.rtol * before
+        rough = ((jnp.abs(expected) <= little) & ~(gained < -little)) | jnp.all(jnp.abs(y_eval - y) <= EXACT)
+        return 1.0 / damping, accept, optx.RESULTS.successful, SearchState(damping, ~accept, ~accept & rough)
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
     """`optimistix.LevenbergMarquardt` with another damping, another rule to change it, and another end.
 
-    - `rtol`, `atol`: changes of parameters and residual at which it ends. Where steps fail, it also ends once the
-      predicted gain is below `rtol` times the loss.
+    It ends where the part of the residual that an undamped step should take away is small (Bates and Watts, A relative
+    offset convergence criterion for nonlinear least squares, 1981), and where steps fail since the function is rough.
+    Short steps and small gains of damped ones are no sign of a minimum, and residuals have no unit to be small in.
+
+    - `rtol`: size of that part, relative to the residual; after a step that failed, its gain, relative to the loss.
     - `free`: the parameters that it steps in.
     """
 
@@ -141,19 +183,25 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     atol: int | float
     norm: Callable
     descent: optx.AbstractDescent
-    search: optx.AbstractSearch
+    search: _DelayedDamping
     verbose: Callable
 
-    def __init__(self, rtol: int | float, atol: int | float, free: FreeParameters) -> None:
-        self.rtol, self.atol = rtol, atol
+    def __init__(self, rtol: int | float, free: FreeParameters) -> None:
+        self.rtol = self.atol = rtol
         self.norm, self.verbose = optx.max_norm, _silent
         self.descent, self.search = _ScaledDescent(free), _DelayedDamping(rtol, free)
 
     def terminate(
         self, fn: Callable, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        done, result = super().terminate(fn, y, args, options, state, tags)
-        return done | state.search_state[1], result
+        model, found = state.descent_state, state.search_state
+        step, gain = model.undamped()
+        # A step that has to end early tells nothing of those that follow: where an exponential is small, a rising one
+        # gains little.
+        cut = jnp.any(step > 0.5 * self.search.free.longest)
+        enough = jnp.where(found.failed, self.rtol, self.rtol**2) * state.f_info.as_min()
+        idle = ((gain <= enough) & ~cut) | jnp.all(jnp.abs(step) <= jnp.finfo(step.dtype).eps)
+        return idle | found.rough, optx.RESULTS.successful
 
 
 def _silent(**values):

@@ -98,7 +98,7 @@ def profile(
         places = _default_places(spread, entry, whole_number(count, "count", least=3))
     else:
         places = _places_of(spread.free, spread.z, index, entry, _checked(values), name)
-    given = LevenbergMarquardt(tolerance, tolerance, spread.free), function, spread.free, None, False
+    given = LevenbergMarquardt(tolerance, spread.free), function, spread.free, None, False
     with compiling():
         again, _ = sensitivity(Squares(*given), spread.z, data)
     _check_same(float(0.5 * again @ again), found.loss, len(found.residual))

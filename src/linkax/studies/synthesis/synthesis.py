@@ -99,7 +99,7 @@ def synthesis(
         )
     scale = np.median(errors[possible])
     best = np.argsort(np.where(possible, errors + scale * misses, np.inf))[: min(kept, int(np.sum(possible)))]
-    search = Squares(LevenbergMarquardt(tolerance, tolerance, free), judge.residual, free, None, False)
+    search = Squares(LevenbergMarquardt(tolerance, free), judge.residual, free, None, False)
     z, ended = z[best], []
     for weight in WEIGHTS if set(least) - {WHOLE} else WEIGHTS[:1]:
         args = (jnp.asarray(weight * np.sqrt(scale)),)
