@@ -190,6 +190,39 @@ def test_what_lies_on_a_bound_is_named_and_has_no_error(kind, slope, side, tmp_p
     assert f"on its {side} bound" in found.report(tmp_path / "fit.html").read_text()
 
 
+@pytest.mark.parametrize("start", [0.0, lx.Bounded(0.0, 0.0, 1.0), lx.Bounded(1e-12, 0.0, 1.0), lx.Bounded(0.0, -1, 1)])
+def test_a_start_without_slope_is_left(start):
+    """A damping ratio enters by its square, so that zero is a saddle, which no step by slopes leaves."""
+    data = np.asarray(resonance({"frequency": 0.6, "damping": 0.2})) + NOISE
+    residual = lambda p, data: resonance(p) - data
+    from_inside = lx.fit(residual, {"frequency": 0.5, "damping": 0.1}, (data,))
+    for frequency in (0.3, 0.8, 1.2):
+        found = lx.fit(residual, {"frequency": lx.Positive(frequency), "damping": start}, (data,))
+        np.testing.assert_allclose(found.params["frequency"], from_inside.params["frequency"], rtol=1e-6)
+        np.testing.assert_allclose(np.abs(found.params["damping"]), from_inside.params["damping"], rtol=1e-6)
+    alone = lx.fit(lambda p: p["damping"] ** 2 - 0.04 + NOISE, {"damping": start})
+    np.testing.assert_allclose(alone.params["damping"] ** 2, 0.04 - np.mean(NOISE), rtol=1e-6)
+
+
+def test_without_damping_the_start_stays():
+    """Where the loss rises along it, and where the parameter has no influence at all."""
+    data = np.asarray(resonance({"frequency": 1.6, "damping": 0.0})) + 0.1 * NOISE
+    with pytest.warns(UserWarning, match="do not determine 'damping', 'idle'"):
+        found = lx.fit(
+            lambda p, data: resonance(p) + 0.0 * p["idle"] - data,
+            {"frequency": lx.Positive(1.8), "damping": lx.Bounded(0.0, 0.0, 1.0), "idle": 1.0},
+            (data,),
+        )
+    assert (found.params["damping"], found.params["idle"]) == (0.0, 1.0)
+
+
+def test_a_loss_without_slope_is_told():
+    loss = lambda p: (p["x"] ** 2 - 1.0) ** 2 + (p["y"] - 2.0) ** 2 + (p["z"] - 1.0) ** 2
+    with pytest.warns(UserWarning, match="do not determine 'x': a small change of it leaves the loss"):
+        found = lx.fit(loss, {"x": 0.0, "y": 1.0, "z": 1.0}, patience=20)
+    assert found.undetermined == ["x"]
+
+
 def test_an_interval_ends_at_a_bound():
     """Of a best value inside, too, and so does its profile."""
     data = -0.003 * X + 0.3 + NOISE

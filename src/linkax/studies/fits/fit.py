@@ -15,6 +15,7 @@ from linkax.model.code import ByValue
 from linkax.model.numbers import number, require, require_type, whole_number
 from linkax.studies.fits.fit_result import Fit, Starts, doubts
 from linkax.studies.fits.fit_search import (
+    ASIDE,
     AbstractSearch,
     Descent,
     Mode,
@@ -124,16 +125,17 @@ def fit(
     is_loss = _is_loss(function, free, data)
     search = _search_by(optimiser, function, free, mode, is_loss, tolerance)
     steps = DEFAULT_STEPS["loss" if is_loss else "residual"] if steps is None else steps
-    z, others = None, None
+    begin, others = free.start, None
     if places is not None:
-        z, others = _best_start(search, places, data, steps, progress, checkpoint)
-    z, losses, ended = run_search(search, data, steps, tolerance, patience, checkpoint, progress, z)
+        begin, others = _best_start(search, places, data, steps, progress, checkpoint)
+    z, losses, ended = run_search(search, data, steps, tolerance, patience, checkpoint, progress, begin)
     if laboratory is not None and laboratory.finds_noise:
         again = lambda data, z, left: run_search(search, data, left, tolerance, patience, None, progress, z)
         z, data, ended = _settled(again, search, laboratory, z, data, steps, losses, ended)
     if is_loss:
         result = _without_covariance(search, z, min(losses), None, losses, ended)
-        result = result._replace(on_bound=_named(search.free, _near_ends(search.free, z)))
+        on_bound = _named(search.free, _near_ends(search.free, z))
+        result = result._replace(on_bound=on_bound, undetermined=_still(search, z, begin, data, losses, on_bound))
     else:
         result = _fit_of_residual(search, z, data, losses, ended, tolerance, laboratory)
     _warn(result)
@@ -278,6 +280,16 @@ def _near_ends(free, z) -> Int[np.ndarray, " p"]:
     return upper.astype(int) - lower.astype(int)
 
 
+def _still(search, z, begin, args, losses, on_bound) -> list[str]:
+    """The names of those that no step has moved, since the loss has no slope there, although it is no minimum."""
+    still = np.asarray(z == begin)
+    if np.all(still) and (len(losses) == 1 or len(set(losses)) > 1):
+        return []  # there was no step, or all were too long
+    flat, names = eqx.filter_jit(search.flat), search.free.free_names
+    falls = lambda entry: flat(z.at[entry].add(ASIDE), args)[0] <= flat(z, args)[0]
+    return [names[entry] for entry in np.flatnonzero(still) if names[entry] not in on_bound and falls(entry)]
+
+
 def _named(free, sides) -> dict[str, str]:
     """The names of those that are on a bound, as in `Fit.on_bound`."""
     return {name: "lower" if side < 0 else "upper" for name, side in zip(free.free_names, sides, strict=True) if side}
@@ -309,9 +321,10 @@ def _warn(result: Fit):
         warn(doubt)
     if result.undetermined:
         warn(
-            f"the data do not determine {', '.join(map(repr, result.undetermined))}: a change of "
-            f"{'it' if len(result.undetermined) == 1 else 'them together'} leaves the residual as it is; fix "
-            "some, or measure what they act on"
+            f"the data do not determine {', '.join(map(repr, result.undetermined))}: a small change of "
+            f"{'it' if len(result.undetermined) == 1 else 'them together'} leaves the "
+            f"{'loss' if result.residual is None else 'residual'} as it is; fix some, measure what they act on, or "
+            "start elsewhere"
         )
 
 

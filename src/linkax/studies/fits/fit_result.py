@@ -95,7 +95,8 @@ class Fit(NamedTuple):
       for numbers that the data do not determine; None for a loss, and where the fit ended at an edge, without
       derivative or without a better step. `noise`: standard deviation of the residual, None likewise; of experiments in
       units of the noise that sensors give, or that was found.
-    - `undetermined`: names of the numbers that the data do not determine.
+    - `undetermined`: names of the numbers that the data do not determine; of a loss, of those along which it has no
+      slope where the fit starts, unless it rises aside from there.
     - `on_bound`: {name: "lower" or "upper"} of the numbers that lie on a bound, beyond which the loss would fall
       further, or, of a loss, within 1e-4 of the range from it. They have no standard error: their covariance is NaN,
       and that of other numbers is as if they were known. Of a `PhysicalInertia` it has the parameter's own name, where

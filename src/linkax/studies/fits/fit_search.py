@@ -17,12 +17,16 @@ from jaxtyping import Bool, Float
 
 from linkax.files import writable_folder, written_whole
 from linkax.model.numbers import require_type
+from linkax.studies.fits.levenberg_marquardt import LinearModel
 from linkax.studies.parameters.fingerprint import fingerprint
 from linkax.studies.parameters.free_parameters import FreeParameters
 from linkax.xla.arrays import Array
 from linkax.xla.waiting import Progress, compiling
 
 FEW = 3  # parameters up to which forward mode is cheaper than reverse mode
+FAINT = 1e-6  # effect of a free number, relative to the largest or the residual, up to which its square may have more
+ASIDE = 1e-2  # of a free number, to see whether it does
+FURTHEST = 10.0  # times as far, that this tells of
 Mode = Literal["forward", "reverse"]
 Evaluation = tuple[Float[Array, " n"], Float[Array, "n p"]] | tuple[()]
 Step = tuple[Float[Array, " p"], Any, Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]
@@ -77,6 +81,12 @@ class AbstractSearch(eqx.Module):
         The loss is that at the next z for `Squares`, and at this z for `Descent`.
         """
 
+    @abc.abstractmethod
+    def aside(
+        self, z: Float[Array, " p"], args: tuple, found: Evaluation, tolerance: int | float
+    ) -> tuple[Float[Array, " p"], Evaluation] | None:
+        """Beside z, where no step leads away from it, a place of lower loss, and what is evaluated there."""
+
 
 @eqx.filter_jit
 def sensitivity(
@@ -108,6 +118,27 @@ class Squares(AbstractSearch):
         state = eqx.tree_at(lambda state: state.y_eval, state, z + jnp.clip(state.y_eval - z, low, high))
         smooth = jnp.all(jnp.isfinite(state.f_info.jac.as_matrix()))
         return z, state, 0.5 * jnp.sum(state.f_info.residual**2), smooth, done
+
+    def aside(
+        self, z: Float[Array, " p"], args: tuple, found: Evaluation, tolerance: int | float
+    ) -> tuple[Float[Array, " p"], Evaluation] | None:
+        # A damping that enters by its square, or an eccentricity, has no slope at zero, and the loss may fall along it.
+        # There the residual is a function of its square: a slope by that is what it gains from a short way.
+        residual, slopes = cast(Any, found)
+        sizes, move = jnp.linalg.norm(slopes, axis=0), jnp.zeros_like(z)
+        for entry in np.flatnonzero(sizes <= FAINT * jnp.maximum(jnp.max(sizes), jnp.linalg.norm(residual))):
+            length = ASIDE if z[entry] + ASIDE <= self.free.ends[1][entry] else -ASIDE
+            there, _ = sensitivity(self, jnp.asarray(z).at[entry].add(length), args)
+            bent = there - residual - length * slopes[:, entry]
+            if residual @ bent < 0.0:
+                move = move.at[entry].set(length * jnp.minimum(jnp.sqrt(-residual @ bent / (bent @ bent)), FURTHEST))
+        if not jnp.any(move):
+            return None
+        moved = z + jnp.clip(move, *self.free.room(z))
+        lower = sensitivity(self, moved, args)
+        gain = 0.5 * (residual @ residual - lower[0] @ lower[0])
+        least = 0.5 * tolerance * residual @ residual + LinearModel.at(z, residual, slopes, self.free).rounding()
+        return (moved, lower) if gain > least else None
 
 
 def _residual(value, slopes):
@@ -147,6 +178,11 @@ class Descent(AbstractSearch):
         moved = z + jnp.clip(moved - z, low, high)
         return moved, state, value, jnp.all(jnp.isfinite(slope)), jnp.zeros((), bool)
 
+    def aside(
+        self, z: Float[Array, " p"], args: tuple, found: Evaluation, tolerance: int | float
+    ) -> tuple[Float[Array, " p"], Evaluation] | None:
+        return None
+
 
 @eqx.filter_jit
 def _begin(search, z, found):
@@ -166,18 +202,19 @@ def run_search(
     patience: int | None,
     checkpoint: str | os.PathLike | None,
     progress: bool | None,
-    start: Float[Array, " p"] | None = None,
+    start: Float[Array, " p"],
 ) -> tuple[Float[Array, " p"], list[float], str]:
-    """Search from z = `start`, by default that of the parameters; see `linkax.fit` for the other arguments.
+    """Search from z = `start`; see `linkax.fit` for the other arguments.
 
     **Returns:** the z of smallest loss, the loss at each step, and how the search ended, as in `linkax.Fit`.
 
     **Raises:** `ValueError` where the function is not finite or has no derivative at the start, and for a checkpoint
     of another fit.
     """
-    z = search.free.start if start is None else start
+    z = start
     with compiling():
         found = search.evaluated(search.tried(z, None), args)
+        z, found = search.aside(z, args, found, tolerance) or (z, found)
         state = _begin(search, z, found)
     losses, best, best_z, waited, ended = [], np.inf, z, 0, None
     programs = [(_step, (search, z, state, args, found))] + [(sensitivity, (search, z, args))] * bool(found)
@@ -202,6 +239,11 @@ def run_search(
             best, best_z = (loss, here) if loss <= best else (best, best_z)
             line.tell("fitting", len(losses), f", loss {loss:.6g}")
             ended = _ending(loss, smooth, done)
+            if ended == "converged":
+                here = state.f_info.residual, state.f_info.jac.as_matrix()
+                if (aside := search.aside(z, args, here, tolerance)) is not None:
+                    z, found = aside
+                    state, ended = _begin(search, z, found), None
             if kept is not None:
                 kept.save((z, best_z, state), losses=losses, waited=waited, ended=ended)
     return best_z, losses, ended or ("stopped early" if impatient() else "out of steps")
