@@ -350,15 +350,10 @@ def check_output(shape: Any, what: str) -> None:
         )
 
 
-@eqx.filter_jit
-def _undamped(model):
-    return model.undamped()
-
-
 def _checked_end(search, z, args, residual, slopes, tolerance) -> str:
     """How a search ended that says it has converged, by what an undamped step should gain and where it leads."""
     model = LinearModel.at(z, residual, slopes, search.free)
-    step, gain = _undamped(model)
+    step, gain = model.undamped()
     loss = 0.5 * residual @ residual
     if gain <= max(tolerance, np.finfo(float).eps) * loss + model.rounding():
         return "converged"

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
 from jax import lax
@@ -50,6 +51,7 @@ class LinearModel(NamedTuple):
         matrix = jnp.where(matters, self.slopes / sizes, 0.0)
         return least_squares_within(matrix, self.residual, damping, self.low * sizes, self.high * sizes) / sizes
 
+    @eqx.filter_jit
     def undamped(self) -> tuple[Float[Array, " p"], Float[Array, ""]]:
         """The step that should gain most, and by how much it should lower the loss.
 

@@ -84,17 +84,15 @@ class FreeParameters(eqx.Module):
                 "each with the same first axis, one entry for each start"
             )
 
-        def z_of(*parts):
-            free = [
-                eqx.tree_at(lambda leaf: leaf.value, leaf, part).free if isinstance(leaf, AbstractParameter) else part
-                for leaf, part in zip(self.leaves, parts, strict=True)
-            ]
-            return self._within(ravel_pytree([part / scale for part, scale in zip(free, self.scales, strict=True)])[0])
+        return jax.vmap(self._of_values)(parts)
 
-        return jax.vmap(z_of)(*parts)
-
-    def _within(self, z):
-        """z, NaN where it is not between the ends."""
+    def _of_values(self, values):
+        """z of the values of the leaves, NaN where it is not between the ends."""
+        leaves = [
+            eqx.tree_at(lambda leaf: leaf.value, leaf, value) if _is_parameter(leaf) else value
+            for leaf, value in zip(self.leaves, values, strict=True)
+        ]
+        z = eqx.tree_at(lambda free: free.leaves, self, leaves).start
         lower, upper = self.ends
         return jnp.where((z >= lower) & (z <= upper), z, jnp.nan)
 
@@ -152,12 +150,7 @@ class FreeParameters(eqx.Module):
 
     def at(self, params: Any) -> Float[Array, " p"]:
         """z of numbers in the structure of `params`; NaN or infinite where they are out of bounds."""
-        values = self.structure.flatten_up_to(params)
-        leaves = [
-            eqx.tree_at(lambda leaf: leaf.value, leaf, value) if isinstance(leaf, AbstractParameter) else value
-            for leaf, value in zip(self.leaves, values, strict=True)
-        ]
-        return self._within(eqx.tree_at(lambda free: free.leaves, self, leaves).start)
+        return self._of_values(self.structure.flatten_up_to(params))
 
     def vector(self, z: Float[Array, " p"]) -> Float[Array, " n"]:
         """All numbers of `params(z)`."""
@@ -168,7 +161,7 @@ class FreeParameters(eqx.Module):
         """Names of the entries of z: of one number each, or of a leaf whose numbers depend on several entries."""
         names, later = [], list(self.names)
         for of_leaf, leaf, scale in zip(self.leaf_names, self.leaves, self.scales, strict=True):
-            size = sum(jnp.size(x) for x in jax.tree.leaves(getattr(leaf, "value", leaf)))
+            size = _size(leaf)
             own, later = later[:size], later[size:]
             names += own if size == scale.size else [of_leaf] * scale.size
         return names
@@ -176,10 +169,7 @@ class FreeParameters(eqx.Module):
     @property
     def apart(self) -> Bool[np.ndarray, " n"]:
         """Whether each number of `vector` is a rising function of one entry of z alone."""
-        sizes = [
-            (sum(jnp.size(x) for x in jax.tree.leaves(getattr(leaf, "value", leaf))), scale.size)
-            for leaf, scale in zip(self.leaves, self.scales, strict=True)
-        ]
+        sizes = [(_size(leaf), scale.size) for leaf, scale in zip(self.leaves, self.scales, strict=True)]
         return np.concatenate([np.full(numbers, numbers == free) for numbers, free in sizes])
 
 
@@ -190,6 +180,11 @@ def has_prior(leaf: Any) -> bool:
 
 def _is_parameter(node) -> bool:
     return isinstance(node, AbstractParameter)
+
+
+def _size(leaf) -> int:
+    """How many numbers the user's function gets of a leaf."""
+    return sum(jnp.size(x) for x in jax.tree.leaves(getattr(leaf, "value", leaf)))
 
 
 def _scales(leaf):

@@ -193,12 +193,7 @@ def uncertainty(
     lost = np.any(np.abs(unseen) > INVOLVED, axis=1)
     slopes_of_params = np.asarray(jax.jacfwd(free.vector)(z))
     covariance = slopes_of_params @ of_free @ slopes_of_params.T
-    depends = np.abs(slopes_of_params)
-    depends = np.where(depends > NO_INFLUENCE * np.max(depends, axis=1, keepdims=True), slopes_of_params, 0.0)
-    # A number is undetermined where the free numbers that it depends on are, and their changes do not cancel.
-    each = np.abs(depends) @ np.where(np.abs(unseen) > INVOLVED, np.abs(unseen) / scale[:, None], 0.0)
-    together = np.abs(depends @ (unseen / scale[:, None]))
-    undetermined = np.any((each > 0.0) & (together > INVOLVED * each), axis=1)
+    undetermined = _undetermined(slopes_of_params, unseen, scale)
     covariance[undetermined, undetermined] = np.inf
     deviation, beyond = np.sqrt(np.where(lost, np.inf, np.diagonal(of_free))), np.zeros(size)
     for entry in np.flatnonzero(sides):
@@ -211,3 +206,12 @@ def uncertainty(
     names = [name for name, is_lost in zip(free.names, undetermined, strict=True) if is_lost]
     spread = Spread(free, z, covariance, of_free, deviation, to_free, scatter.noise, freedom, sides, beyond)
     return Uncertainty(covariance, scatter.noise, names, spread)
+
+
+def _undetermined(slopes_of_params, unseen, scale):
+    """Which numbers depend on free numbers that are not determined, whose changes do not cancel."""
+    depends = np.abs(slopes_of_params)
+    depends = np.where(depends > NO_INFLUENCE * np.max(depends, axis=1, keepdims=True), slopes_of_params, 0.0)
+    each = np.abs(depends) @ np.where(np.abs(unseen) > INVOLVED, np.abs(unseen) / scale[:, None], 0.0)
+    together = np.abs(depends @ (unseen / scale[:, None]))
+    return np.any((each > 0.0) & (together > INVOLVED * each), axis=1)
