@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Bool, Int
 
 from linkax.model.code import ByValue
-from linkax.model.numbers import number, require, require_type, whole_number
+from linkax.model.numbers import require_type, whole_number
 from linkax.studies.fits.fit_result import Fit, Starts, doubts
 from linkax.studies.fits.fit_search import (
     ASIDE,
@@ -20,6 +20,7 @@ from linkax.studies.fits.fit_search import (
     Descent,
     Mode,
     Squares,
+    checked_tolerance,
     checkpoint_path,
     run_search,
     search_from_each,
@@ -117,7 +118,8 @@ def fit(
     function, free = ByValue.each(function), FreeParameters.of(params)
     require_type(args, list | tuple, "args", "give a tuple of what else the function gets")
     data = as_arrays(tuple(args), "args")
-    _check_ending(steps, tolerance, patience)
+    _check_ending(steps, patience)
+    tolerance = checked_tolerance(tolerance)
     places = None if starts is None else free.starts(starts)
     laboratory = None
     if not callable(function):
@@ -363,12 +365,9 @@ def _checked_end(search, z, args, residual, slopes, tolerance) -> str:
     return "no better step" if 2.0 * gain > FAR**2 * variance else "converged"
 
 
-def _check_ending(steps, tolerance, patience):
+def _check_ending(steps, patience):
     """Raise a ValueError where no search can end by these numbers."""
     if steps is not None:
         whole_number(steps, "steps", least=0)
     if patience is not None:
         whole_number(patience, "patience")
-    require(
-        number(tolerance, (), "tolerance"), lambda x: x >= 0.0, "tolerance", "it must be zero or more, such as 1e-6"
-    )

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 
 from linkax.files import writable_folder, written_whole
-from linkax.model.numbers import require_type
+from linkax.model.numbers import number, require, require_type
 from linkax.studies.fits.levenberg_marquardt import LinearModel
 from linkax.studies.parameters.fingerprint import fingerprint
 from linkax.studies.parameters.free_parameters import FreeParameters
@@ -341,6 +341,13 @@ def _check_start(loss, smooth):
             "the function has no derivative at the parameters where the fit starts, as a square root has none at zero; "
             "start elsewhere, or ask `linkax.differentiability`"
         )
+
+
+def checked_tolerance(tolerance: int | float) -> float:
+    """Check how closely a search is to end."""
+    not_negative = lambda x: x >= 0.0
+    remedy = "it must be zero or more, such as 1e-6"
+    return float(require(number(tolerance, (), "tolerance"), not_negative, "tolerance", remedy))
 
 
 def checkpoint_path(path: str | os.PathLike) -> Path:

@@ -11,9 +11,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float
 
 from linkax.model.code import ByValue
-from linkax.model.numbers import is_finite, number, real, require, require_type, whole_number
+from linkax.model.numbers import is_finite, real, require, require_type, whole_number
 from linkax.studies.fits.fit_result import Fit
-from linkax.studies.fits.fit_search import Squares, search_from_each, sensitivity
+from linkax.studies.fits.fit_search import Squares, checked_tolerance, search_from_each, sensitivity
 from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.fits.profile_result import Profile
 from linkax.studies.laboratory.experiments import Experiment
@@ -91,8 +91,7 @@ def profile(
     if not callable(function):
         function, data = _of_experiments(function, found, args)
     whole_number(steps, "steps")
-    finer = lambda x: x >= 0.0
-    tolerance = float(require(number(tolerance, (), "tolerance"), finer, "tolerance", "it must be zero or more"))
+    tolerance = checked_tolerance(tolerance)
     index, entry = _place(found, spread.free, name)
     if values is None:
         places = _default_places(spread, entry, whole_number(count, "count", least=3))

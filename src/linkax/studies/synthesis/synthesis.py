@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from linkax.analysis.trace import Trace
 from linkax.model.code import ByValue
-from linkax.model.numbers import number, require, require_bool, require_type, whole_number
+from linkax.model.numbers import require_bool, require_type, whole_number
 from linkax.simulation.integrate.results import RESULTS
-from linkax.studies.fits.fit_search import Squares, search_from_each
+from linkax.studies.fits.fit_search import Squares, checked_tolerance, search_from_each
 from linkax.studies.fits.levenberg_marquardt import LevenbergMarquardt
 from linkax.studies.parameters.free_parameters import FreeParameters
 from linkax.studies.parameters.parameters import Bounded
@@ -82,8 +82,7 @@ def synthesis(
     whole_number(kept, "kept")
     whole_number(seed, "seed", least=0)
     whole_number(steps, "steps")
-    finer = lambda x: x >= 0.0
-    tolerance = float(require(number(tolerance, (), "tolerance"), finer, "tolerance", "it must be zero or more"))
+    tolerance = checked_tolerance(tolerance)
     if progress is not None:
         require_bool(progress, "progress")
     free = FreeParameters.of(params)
