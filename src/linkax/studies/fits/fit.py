@@ -46,6 +46,7 @@ SETTLED_ENDS = "converged", "stopped early"
 AT_END = 1e-4  # of the range between bounds, up to which a number is on one, of a loss
 SETTLED = 1e-2  # relative change of the noise of sensors, from which on it stays as it is found
 ROUNDS = 10  # of finding it
+THERE = 1e-5  # change of a free number, up to which a search was where it ended
 FAR = 0.1  # from a minimum, in standard errors, up to which a search may have converged
 DEFAULT_RATE = 0.02  # of Adam, in parameters that all start near one
 NO_MINIMUM = {
@@ -355,9 +356,9 @@ def check_output(shape: Any, what: str) -> None:
 def _checked_end(search, z, args, residual, slopes, tolerance) -> str:
     """How a search ended that says it has converged, by what an undamped step should gain and where it leads."""
     model = LinearModel.at(z, residual, slopes, search.free)
-    step, gain = model.undamped()
+    step, gain = model.undamped(1.0)
     loss = 0.5 * residual @ residual
-    if gain <= max(tolerance, np.finfo(float).eps) * loss + model.rounding():
+    if gain <= max(tolerance, np.finfo(float).eps) * loss or np.max(np.abs(step)) <= THERE:
         return "converged"
     if not np.all(np.isfinite(sensitivity(search, z + step, args)[0])):
         return "at an edge"

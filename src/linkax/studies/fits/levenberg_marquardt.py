@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import lax
 from jaxtyping import ArrayLike, Bool, Float
@@ -18,6 +19,8 @@ LEAST_DAMPING = 1e-12
 HIGHER, LOWER = 2.0, 5.0
 ENOUGH = 0.25  # gain of a step, relative to the predicted one, above which the next is damped less
 EXACT = 1e-11  # change of a free number that is rounding
+ROUNDING = 1e-13  # of the residual, relative to its largest sensitivity so far
+FALLEN = 1e-3  # sensitivity, relative to its largest so far, from which on slopes tell of no long way
 TURNS = 3  # for each parameter, in which the best step within bounds is found
 
 
@@ -52,20 +55,20 @@ class LinearModel(NamedTuple):
         return least_squares_within(matrix, self.residual, damping, self.low * sizes, self.high * sizes) / sizes
 
     @eqx.filter_jit
-    def undamped(self) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-        """The step that should gain most, and by how much it should lower the loss.
+    def undamped(self, reach: ArrayLike = np.inf) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+        """The step that should gain most, no longer than `reach`, and by how much it should lower the loss.
 
         The units are those of the slopes here: those of a place before may be so much larger that they damp it.
         """
-        step = self._replace(sizes=jnp.linalg.norm(self.slopes, axis=0)).step(LEAST_DAMPING)
+        low, high = jnp.maximum(self.low, -jnp.asarray(reach)), jnp.minimum(self.high, reach)
+        here = self._replace(sizes=jnp.linalg.norm(self.slopes, axis=0), low=low, high=high)
+        step = here.step(LEAST_DAMPING)
         left = self.residual + self.slopes @ step
         return step, 0.5 * (self.residual @ self.residual - left @ left)
 
     def rounding(self) -> Float[Array, ""]:
         """The loss that rounding may leave of data without noise."""
-        sizes = jnp.linalg.norm(self.slopes, axis=0)
-        least = jnp.min(jnp.where(sizes >= NO_INFLUENCE * jnp.max(sizes), sizes, jnp.inf))
-        return 0.5 * (EXACT * least) ** 2
+        return 0.5 * (ROUNDING * jnp.max(self.sizes)) ** 2
 
 
 def least_squares_within(
@@ -196,14 +199,17 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     def terminate(
         self, fn: Callable, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        model, found = state.descent_state, state.search_state
-        step, gain = model.undamped()
+        model, found, loss = state.descent_state, state.search_state, state.f_info.as_min()
+        # Towards the zero of a parameter that enters by its square slopes vanish, and ask for ever longer steps; there
+        # they fall as the way to the zero does.
+        left = jnp.linalg.norm(model.slopes, axis=0) / jnp.maximum(model.sizes, jnp.finfo(loss.dtype).tiny)
+        step, gain = model.undamped(jnp.where(left < FALLEN, left, jnp.inf))
         # A step that has to end early tells nothing of those that follow: where an exponential is small, a rising one
         # gains little.
         cut = jnp.any(step > 0.5 * self.search.free.longest)
-        enough = jnp.where(found.failed, self.rtol, self.rtol**2) * state.f_info.as_min()
-        idle = ((gain <= enough) & ~cut) | jnp.all(jnp.abs(step) <= jnp.finfo(step.dtype).eps)
-        return idle | found.rough, optx.RESULTS.successful
+        idle = (gain <= jnp.where(found.failed, self.rtol, self.rtol**2) * loss) & ~cut
+        exact = (loss <= model.rounding()) | jnp.all(jnp.abs(step) <= jnp.finfo(step.dtype).eps)
+        return idle | exact | found.rough, optx.RESULTS.successful
 
 
 def _silent(**values):
