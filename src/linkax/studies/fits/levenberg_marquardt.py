@@ -19,7 +19,7 @@ LEAST_DAMPING = 1e-12
 HIGHER, LOWER = 2.0, 5.0
 ENOUGH = 0.25  # gain of a step, relative to the predicted one, above which the next is damped less
 EXACT = 1e-11  # change of a free number that is rounding
-ROUNDING = 1e-13  # of the residual, relative to its largest sensitivity so far
+ROUNDING = 1e-13  # of the residual, relative to that at the start, or to its largest sensitivity
 FALLEN = 1e-3  # sensitivity, relative to its largest so far, from which on slopes tell of no long way
 TURNS = 3  # for each parameter, in which the best step within bounds is found
 
@@ -130,9 +130,14 @@ class _ScaledDescent(optx.AbstractDescent):
 
 
 class SearchState(NamedTuple):
-    """- `damping`: λ. `failed`: whether the step did. `rough`: whether it did so since the function is rough."""
+    """State of `_DelayedDamping`.
+
+    - `damping`: λ. `first`: loss at the start.
+    - `failed`: whether the last step did. `rough`: whether it did so since the function is rough.
+    """
 
     damping: Float[Array, ""]
+    first: Float[Array, ""]
     failed: Bool[Array, ""]
     rough: Bool[Array, ""]
 
@@ -148,7 +153,8 @@ class _DelayedDamping(optx.AbstractSearch):
     free: FreeParameters
 
     def init(self, y: Float[Array, " p"], f_info_struct: Any) -> SearchState:
-        return SearchState(jnp.asarray(FIRST_DAMPING, y.dtype), *2 * (jnp.zeros((), bool),))
+        none = jnp.zeros((), y.dtype)
+        return SearchState(none + FIRST_DAMPING, none, *2 * (jnp.zeros((), bool),))
 
     def step(
         self,
@@ -170,7 +176,8 @@ class _DelayedDamping(optx.AbstractSearch):
         # more was lost, unless it led to where the function is not finite.
         little = self.rtol * before
         rough = ((jnp.abs(expected) <= little) & ~(gained < -little)) | jnp.all(jnp.abs(y_eval - y) <= EXACT)
-        return 1.0 / damping, accept, optx.RESULTS.successful, SearchState(damping, ~accept, ~accept & rough)
+        found = SearchState(damping, jnp.where(first_step, after, state.first), ~accept, ~accept & rough)
+        return 1.0 / damping, accept, optx.RESULTS.successful, found
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
@@ -208,7 +215,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         # gains little.
         cut = jnp.any(step > 0.5 * self.search.free.longest)
         idle = (gain <= jnp.where(found.failed, self.rtol, self.rtol**2) * loss) & ~cut
-        exact = (loss <= model.rounding()) | jnp.all(jnp.abs(step) <= jnp.finfo(step.dtype).eps)
+        exact = (loss <= ROUNDING**2 * found.first) | jnp.all(jnp.abs(step) <= jnp.finfo(step.dtype).eps)
         return idle | exact | found.rough, optx.RESULTS.successful
 
 
