@@ -19,7 +19,7 @@ LOCKS = float(np.arcsin(ROD / CRANK))  # where the rod of a longer crank stands 
 
 def sample(distance):
     """d where a step begins, at its stages, and where it ends."""
-    return distance(0.0), distance(NODES), distance(1.0)
+    return tuple(jnp.asarray(distance(at)) for at in (0.0, NODES, 1.0))
 
 
 @pytest.mark.parametrize("time", [1.1, 1.5, 3.0])
