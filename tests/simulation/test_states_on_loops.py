@@ -15,7 +15,7 @@ from linkax.equations.system import system_of
 CLOSED = 1e-9  # radians, or lengths of the loop
 KINDS = 1707  # members of each of six kinds: ten thousand mechanisms in all
 NUMBERS = 6  # random numbers of a mechanism, in [0, 1]
-FAILURES = (lx.RESULTS.not_assembled, lx.RESULTS.locked)
+FAILURES = (lx.RESULTS.not_assembled, lx.RESULTS.locked, lx.RESULTS.dt_min_reached, lx.RESULTS.max_steps_reached)
 
 
 def motor(joint, speed, driven):
