@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import linkax as lx
-from linkax.studies.fits.levenberg_marquardt import least_squares_within
+from linkax.studies.fits.bounded_least_squares import least_squares_within
 
 X = np.linspace(0.05, 1.0, 40)
 NOISE = 0.01 * np.sin(37.0 * np.arange(40) ** 1.5)

@@ -285,12 +285,14 @@ def _near_ends(free, z) -> Int[np.ndarray, " p"]:
 
 def _still(search, z, begin, args, losses, on_bound) -> list[str]:
     """The names of those that no step has moved, since the loss has no slope there, although it is no minimum."""
-    still = np.asarray(z == begin)
-    if np.all(still) and (len(losses) == 1 or len(set(losses)) > 1):
-        return []  # there was no step, or all were too long
-    flat, names = eqx.filter_jit(search.flat), search.free.free_names
-    falls = lambda entry: flat(z.at[entry].add(ASIDE), args)[0] <= flat(z, args)[0]
-    return [names[entry] for entry in np.flatnonzero(still) if names[entry] not in on_bound and falls(entry)]
+    still, names = np.asarray(z == begin), search.free.free_names
+    inside = [entry for entry in np.flatnonzero(still) if names[entry] not in on_bound]
+    # Of all, there was no step, or each was too long.
+    if not inside or (np.all(still) and (len(losses) == 1 or len(set(losses)) > 1)):
+        return []
+    flat = eqx.filter_jit(search.flat)
+    loss = flat(z, args)[0]
+    return [names[entry] for entry in inside if flat(z.at[entry].add(ASIDE), args)[0] <= loss]
 
 
 def _named(free, sides) -> dict[str, str]:
