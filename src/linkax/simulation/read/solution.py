@@ -52,7 +52,7 @@ from linkax.simulation.start.validation import checked_state, checked_time, soun
 from linkax.tables import printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.tracing import all_concrete, concrete, jit_inline
+from linkax.xla.tracing import all_concrete, concrete, jit_inline, without_derivatives
 
 
 @printed_as(summary)
@@ -159,7 +159,8 @@ class Solution(Kinematics):
         result, sound = solution.result, sound_numbers(mechanism)
         topology = mechanism.topology
         if topology.num_rows + topology.num_immobile_rows and not isinstance(method, ClassicalFormulation):
-            off = off_loops(solution.run.flat, solution.t_end, state)
+            # It only decides, and has no derivative.
+            off = off_loops(*without_derivatives((solution.run.flat, solution.t_end, state)))
             if all_concrete(off) and not off.is_small:
                 raise ValueError(f"state is off the loops: {_off(solution, off)}; make it with linkax.assemble")
             result = RESULTS.where(off.is_small, result, RESULTS.not_closed)
