@@ -109,6 +109,18 @@ def test_derivatives_of_modes_and_frequencies(order):
     jax.tree.map(lambda *pair: np.testing.assert_allclose(*pair, atol=1e-9), jax.jit(modes)(at), jax.jit(exact)(at))
 
 
+@pytest.mark.slow
+def test_an_equilibrium_far_along_bent_loops():
+    """Of Bricard's mechanism, whose loops open where a long step goes straight on: where its potential is least."""
+    mechanism, state = start("bricard")
+    still = lx.State(state.q, jnp.zeros_like(state.v))
+    rest = lx.equilibrium(mechanism, still)
+    potential = lx.Solution.of_state(mechanism, rest).potential_energy()[0]
+    swings = lx.simulate(mechanism, still, t1=10.0).potential_energy()
+    assert 0.0 <= np.min(swings) - potential <= 1e-4 * np.ptp(swings)
+    assert lx.linearise(mechanism, rest).natural_frequencies[0] > 1.0
+
+
 @pytest.mark.parametrize("rod", [0.02, 0.3])
 def test_an_equilibrium_of_loops_that_cannot_close_is_marked(rod):
     scene = SCENES["crank-slider"]

@@ -98,12 +98,12 @@ def search_downhill(
         return (search.steps < MOST_STEPS) & (search.longest > SMALLEST_STEP)
 
     def advance(search):
-        """Try a step. If it goes beyond the minimum of the potential, halve it, else choose the next one from there.
+        """Try a step. If it goes beyond the minimum of the potential, or off the loops, halve it, else choose the next.
 
         A step is f / |k| along each eigenvector of the stiffness. At an equilibrium that is unstable it is one along
         the least stable direction.
         """
-        q, _ = method.close(system, t, retract(system.topology, search.q, search.step), zero)
+        q, _, holds = method.close_near(system, t, retract(system.topology, search.q, search.step), zero)
         here = Balanced.of(system, method, t, q)
         force, stiffness = here.force_and_stiffness()
         values, vectors = eigh((stiffness + stiffness.T) / 2.0)
@@ -124,6 +124,7 @@ def search_downhill(
             steps=search.steps + 1, step=search.step / 2.0, longest=search.longest / 2.0, work=search.work / 2.0
         )
         beyond = (here.dual @ search.step) @ force < -OVERSHOOT * search.work
+        beyond = beyond | ((search.steps > 0) & jnp.logical_not(holds))
         return jax.tree.map(lambda a, b: jnp.where(beyond, a, b), half, onwards)
 
     nothing = jnp.zeros((), system.dtype)
@@ -155,12 +156,14 @@ class Standstill(NamedTuple):
 
     - `q`, `internal`: reached. `longest`: the largest part of the last step, or of what steps cannot balance [rad,
       lengths of the mechanism, scales].
+    - `most`: the longest step that is tried [rad, lengths of the mechanism].
     """
 
     steps: Int[Array, ""]
     q: Float[Array, " n_q"]
     internal: Float[Array, " n_s"]
     longest: Float[Array, ""]
+    most: Float[Array, ""]
 
 
 class _WithStates(NamedTuple):
@@ -229,13 +232,18 @@ def search_standstill(
         step = here.step(slopes, unbalanced)
         change, states = here.near.basis @ step[: len(zero)], step[len(zero) :]
         size = system.fastest(change)
-        shorter = jnp.minimum(1.0, ratio(LONGEST_STEP, size))
-        q, _ = method.close(system, t, retract(system.topology, search.q, shorter * change), zero)
+        shorter = jnp.minimum(1.0, ratio(search.most, size))
+        q, _, holds = method.close_near(system, t, retract(system.topology, search.q, shorter * change), zero)
         longest = jnp.maximum(jnp.maximum(size, jnp.max(jnp.abs(states))), here.off(slopes, unbalanced))
-        return Standstill(search.steps + 1, q, search.internal + shorter * here.units * states, longest)
+        states = search.internal + shorter * here.units * states
+        # A step that leaves the loops is tried again, half as long.
+        q, states = jax.tree.map(lambda new, old: jnp.where(holds, new, old), (q, states), (search.q, search.internal))
+        most = jnp.where(holds, LONGEST_STEP, jnp.minimum(search.most, size) / 2.0)
+        return Standstill(search.steps + 1, q, states, longest, most)
 
     q, _ = method.close(system, t, q, zero)
-    begin = Standstill(jnp.zeros((), int), q, internal, jnp.asarray(jnp.inf, system.dtype))
+    infinite = jnp.asarray(jnp.inf, system.dtype)
+    begin = Standstill(jnp.zeros((), int), q, internal, infinite, jnp.full_like(infinite, LONGEST_STEP))
     search = lax.while_loop(unfinished, advance, begin)
     return search.q, search.internal, search
 
