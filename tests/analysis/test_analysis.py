@@ -64,6 +64,8 @@ def test_a_pendulum_comes_to_rest_and_vibrates():
     upright = lx.State(jnp.array([np.pi / 2]), jnp.zeros(1))
     np.testing.assert_allclose(lx.linearise(mechanism, upright).natural_frequencies, [-natural], rtol=1e-12)
     np.testing.assert_allclose(np.sin(lx.equilibrium(mechanism, upright).q), -1.0, atol=1e-12)
+    with pytest.raises(ValueError, match="state is in float32"):
+        lx.equilibrium(mechanism, lx.State(rest.q.astype(np.float32), rest.v.astype(np.float32)))
     with pytest.raises(ValueError, match=r"off an equilibrium.*'hinge' accelerates by -18.39.*linkax.equilibrium"):
         lx.linearise(mechanism, lx.State(jnp.zeros(1), jnp.zeros(1)))
 
@@ -204,3 +206,5 @@ def test_inverse_dynamics_is_in_the_precision_of_the_state():
     found, exact = (lx.inverse_dynamics(mechanism, given, {"bearing": 3.3}) for given in (single, state))
     assert found.acceleration.dtype == found.forces["bearing"].dtype == jnp.float32
     np.testing.assert_allclose(found.forces["bearing"], exact.forces["bearing"], rtol=1e-4)
+    mixed = lx.State(state.q.astype(jnp.float32), state.v)
+    assert lx.inverse_dynamics(mechanism, mixed, {"bearing": 3.3}).acceleration.dtype == jnp.float64

@@ -24,7 +24,7 @@ from linkax.equations.internal_states import bound
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.state import State
-from linkax.simulation.start.validation import checked_state, checked_time, marked
+from linkax.simulation.start.validation import checked_state, checked_time, marked, require_double_precision
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.program import Program
@@ -93,11 +93,12 @@ def equilibrium(mechanism: Mechanism, state: State, *, t: ArrayLike = 0.0) -> St
 
     **Raises:** `EquilibriumError` where the search does not converge, cannot close the loops or leave an unstable
     equilibrium, or where driven joints do not move steadily. Inside JAX transformations nothing is raised, and
-    coordinates are NaN.
+    coordinates are NaN. `ValueError` for a state in single precision.
 
     **Warns:** `StabilityWarning`.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
+    require_double_precision(state, "state")
     moves = may_move(state) and any(constraint.is_driven for constraint in mechanism.constraints)
     reached, ending = _equilibrium(mechanism, state, t, moves)
     if not moves:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from linkax.analysis.linearisation import StateSlopes
 from linkax.analysis.moving import Coefficients, Moving
-from linkax.analysis.steady import AGREES, eigh, largest_force, missed_rates, of_missed_rate
+from linkax.analysis.steady import AGREES, eigh, largest_force, limit, missed_rates, of_missed_rate
 from linkax.equations.configuration import configure
 from linkax.equations.motion import move
 from linkax.equations.system import system_of
@@ -89,17 +89,23 @@ class Steadiness(NamedTuple):
     @property
     def is_steady(self) -> Bool[Array, ""]:
         """Whether all of them are negligible."""
-        still = jnp.max(self.of_states, initial=0.0) <= NEAR
-        return (jnp.max(self.missed, initial=0.0) <= AGREES) & (self.off <= NEAR) & (self.changes <= CONSTANT) & still
+        agrees, near, constant = self._limits
+        still = jnp.max(self.of_states, initial=0.0) <= near
+        return (jnp.max(self.missed, initial=0.0) <= agrees) & (self.off <= near) & (self.changes <= constant) & still
+
+    @property
+    def _limits(self):
+        return [limit(most, self.off.dtype) for most in (AGREES, NEAR, CONSTANT)]
 
     def check(self, mechanism: Mechanism, state: State, t: Float[Array, ""]) -> None:
         """Raise a ValueError where the linearisation would not be constant."""
         missed, topology, when = np.asarray(self.missed), mechanism.topology, f"at t = {float(t):.6g} s"
-        if not np.max(missed, initial=0.0) <= AGREES:
+        agrees, near, constant = self._limits
+        if not np.max(missed, initial=0.0) <= agrees:
             told = of_missed_rate(mechanism, missed, int(np.argmax(missed)), t)
             raise ValueError(f"{told}, or give it speeds of zero, where drives hold")
         acceleration = np.asarray(self.acceleration)
-        if not self.off <= NEAR:
+        if not self.off <= near:
             system = system_of(mechanism, state.q.dtype)
             column = int(np.argmax(np.abs(acceleration / np.asarray(system.scales))))
             joint = next(name for name, columns in topology.speeds.items() if columns.start <= column < columns.stop)
@@ -108,7 +114,7 @@ class Steadiness(NamedTuple):
                 f"joint {joint!r} accelerates by {acceleration[column]:.6g} {when}; begin with linkax.equilibrium"
             )
         of_states = np.asarray(self.of_states)
-        if not np.max(of_states, initial=0.0) <= NEAR:
+        if not np.max(of_states, initial=0.0) <= near:
             names = [f"{name!r} of {force.display_name}" for force in mechanism.forces for name in force.states]
             counts = [entry.initial.size for force in mechanism.forces for entry in force.states.values()]
             worst = np.repeat(names, counts)[np.argmax(of_states)]
@@ -116,7 +122,7 @@ class Steadiness(NamedTuple):
                 f"the internal state {worst} changes {when}: it is {np.max(of_states):.3g} of its scale off where it "
                 "stands still; simulate until it rests"
             )
-        if not self.changes <= CONSTANT:
+        if not self.changes <= constant:
             system = system_of(mechanism, state.q.dtype)
             names = ", ".join(map(repr, moving_joints(system, t, state.q, state.v[:, None])))
             raise ValueError(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from linkax.equations.configuration import configure
@@ -30,6 +31,8 @@ from linkax.xla.tracing import concrete
 # change is missed at all of them.
 LATER = np.array([0.7, 1.9, 41.0])
 AGREES = 1e-6  # relative error of speeds and forces up to which they count as equal
+# Of limits in units of rounding: in single precision a disc that rolls in a circle seems to change by up to 6e-4.
+LEAST_ULPS = 1e4
 
 eigh = one_by_one(jnp.linalg.eigh)
 
@@ -45,6 +48,11 @@ def system_in(mechanism: Mechanism, state: State, t: Float[Array, ""], moves: bo
     system, unless = system_of(mechanism, state.q.dtype), jnp.any(state.v != 0.0) if moves else False
     constraints = tuple(each.held(t, unless) for each in system.constraints)
     return dataclasses.replace(system, constraints=constraints, known=None)
+
+
+def limit(most: float, dtype: DTypeLike) -> float:
+    """A limit of what counts as nothing, or what rounding may leave where that is more: in single precision."""
+    return max(most, LEAST_ULPS * float(jnp.finfo(dtype).eps))
 
 
 class Nearby(eqx.Module):

@@ -29,7 +29,7 @@ from linkax.simulation.read.by_name import BodyPoint
 from linkax.simulation.read.kinematics import Kinematics
 from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.state import State
-from linkax.simulation.start.validation import checked_state, checked_time, sound_numbers
+from linkax.simulation.start.validation import checked_state, checked_time, require_double_precision, sound_numbers
 from linkax.spatial.vectors import cross, dot, length
 from linkax.straight_line.known import flat_with_known
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
@@ -246,8 +246,7 @@ def start_of(mechanism: Mechanism, start: State) -> State:
     if slipping:
         names = " and ".join(slipping)
         raise ValueError(f"{names} holds speeds, and no places that could be traced; integrate by linkax.simulate")
-    if start.q.dtype != np.float64:
-        raise ValueError(f"start is in {start.q.dtype}; make it with linkax.assemble, in double precision")
+    require_double_precision(start, "start")
     return start
 
 

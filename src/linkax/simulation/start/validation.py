@@ -93,7 +93,10 @@ def checked_time(entry: Any, name: str) -> Float[Array, ""]:
 
 
 def checked_state(mechanism: Mechanism, state: State) -> State:
-    """Check a state of a mechanism: floating-point numbers of the right shapes, finite where they are known."""
+    """Check a state of a mechanism: floating-point numbers of the right shapes, finite where they are known.
+
+    Coordinates and speeds of different precision become double precision.
+    """
     check_mechanism(mechanism)
     topology, made = mechanism.topology, "make the state with linkax.assemble"
     require_type(state, State, "state", made)
@@ -117,7 +120,16 @@ def checked_state(mechanism: Mechanism, state: State) -> State:
             require(entries[taken], is_finite, of_joint, "it must be finite")
             if kind.has_quaternion and what == "q":
                 _check_quaternion(entries[taken], of_joint)
-    return State(found[0], found[1], topology, _checked_internal(mechanism, state.internal, found[0].dtype))
+    q, v = found
+    if q.dtype != v.dtype:
+        q, v = (array.astype(jnp.result_type(q.dtype, v.dtype)) for array in found)
+    return State(q, v, topology, _checked_internal(mechanism, state.internal, q.dtype))
+
+
+def require_double_precision(state: State, name: str) -> None:
+    """**Raises:** `ValueError` for a state in single precision, in which a search does not see where it ends."""
+    if state.q.dtype != np.float64:
+        raise ValueError(f"{name} is in {state.q.dtype}; make it with linkax.assemble, in double precision")
 
 
 def _checked_internal(mechanism, given, dtype):
