@@ -64,6 +64,48 @@ def test_a_pulse_at_known_times_is_not_stepped_over(law, read, accuracy):
     assert law is lx.Spline or run.stats["num_steps"] < 20
 
 
+class Box(eqx.Module):
+    """A torque of 5 N m from the first of its times to the last one, which jumps there."""
+
+    times: jax.Array
+
+    def __call__(self, t, motion):
+        return jnp.where((t >= self.times[0]) & (t < self.times[-1]), 5.0, 0.0)
+
+
+def triangle(times):
+    return lx.PiecewiseLinear(times, [0.0, 5.0, 0.0])
+
+
+@pytest.mark.parametrize("law", [triangle, Box])
+@pytest.mark.parametrize("accuracy", [lx.DRAFT, lx.PRECISE])
+def test_derivatives_by_the_times_of_a_pulse(law, accuracy):
+    """Forwards and backwards, with the pulse in the middle of the run, and at its end."""
+    share = 0.5 if law is triangle else 1.0  # of the height that the mean of the pulse is
+
+    def end(numbers, t1):
+        begin, half = numbers
+        arm = pendulum(
+            length=1.0,
+            mass=3.0,
+            gravity=0.0,
+            forces=[lx.JointTorque("hinge", law(begin + half * jnp.arange(3.0)))],
+        )
+        motion = lx.simulate(arm, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=t1, accuracy=accuracy)
+        return jnp.stack([motion.end.q[0], motion.end.v[0], motion.joint("hinge")[100]])
+
+    def exact(numbers, t1):
+        begin, half = numbers
+        speed = share * 5.0 * 2.0 * half
+        return jnp.stack([speed * (t1 - begin - half), speed, jnp.maximum(speed * (t1 / 2.0 - begin - half), 0.0)])
+
+    numbers = jnp.array([0.7, 0.1])
+    for t1 in (2.0, 4.0):
+        slopes = jax.jacfwd(exact)(numbers, t1)
+        for mode in (jax.jacfwd, jax.jacrev):
+            np.testing.assert_allclose(mode(end)(numbers, t1), slopes, rtol=1e-6, atol=1e-6)
+
+
 class Push(lx.AbstractForce):
     """A constant push along a joint while it moves forwards; `unit`: what its switch counts in."""
 

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Bool, Float
 
 from linkax.equations.configuration import configure
@@ -37,8 +38,8 @@ class Problem(eqx.Module):
 
     From a state that motion cannot start from, no step is taken (`can_start`). At `closed_at` [s] the state is on the
     loops already: there a correction would be rounding alone, which close to a singular configuration is amplified.
-    `from_singular`: the run starts in one. `times`: at which steps end, sorted [s]; None for none. Vectors y: see
-    `linkax.simulation.integrate.diffrax_contract`.
+    `from_singular`: the run starts in one. `times`: at which steps end, sorted [s]; None for none. `until`: the end of
+    the step that is taken, see `stage_time`. Vectors y: see `linkax.simulation.integrate.diffrax_contract`.
     """
 
     mechanism: Mechanism
@@ -49,6 +50,14 @@ class Problem(eqx.Module):
     closed_at: Float[Array, ""] | float = np.inf
     from_singular: Bool[Array, ""] | bool = False
     times: Float[Array, " n"] | None = None
+    until: Float[Array, ""] | None = None
+
+    def stage_time(self, t: Float[Array, ""], until: Float[Array, ""] | None) -> Float[Array, ""]:
+        """The time of a stage, just before the end of its step: steps end where laws may jump."""
+        if self.times is None or until is None:
+            return t
+        end = lax.stop_gradient(until)
+        return jnp.minimum(t, until + (jnp.nextafter(end, -jnp.inf) - end))
 
     def packed(
         self,
@@ -156,4 +165,4 @@ class Problem(eqx.Module):
 
 def derivative(t: Any, y: Float[Array, " n"], problem: Problem) -> Float[Array, " n"]:
     """The right-hand side of diffrax: `Problem.derivative`."""
-    return problem.derivative(t, y)
+    return problem.derivative(problem.stage_time(t, problem.until), y)

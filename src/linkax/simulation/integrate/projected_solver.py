@@ -187,11 +187,14 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         made_jump: Bool[Array, ""] | bool,
     ) -> tuple[Float[Array, " n"], StepError, dict[str, Any], SolverState, diffrax.RESULTS]:
         """Take a step with the solver inside and correct it; its error and state are those of `diffrax_contract`."""
-        # Solvers that begin with the last derivative of the step before must not where the state has moved since.
+        # Solvers that begin with the last derivative of the step before must not where the state has moved since, nor
+        # where laws may have jumped.
         switching = len(args.sides(y0)) > 0
-        made_jump = True if switching or (self.after_step and args.method.moves_after_steps) else made_jump
+        moved = self.after_step and args.method.moves_after_steps
+        made_jump = True if switching or moved or args.times is not None else made_jump
         solver = self._stepping(args, t0, y0, t1 - t0)
-        y1, error, dense_info, inner, result = solver.step(terms, t0, t1, y0, args, solver_state.inner, made_jump)
+        stepped = args if args.times is None else dataclasses.replace(args, until=t1)
+        y1, error, dense_info, inner, result = solver.step(terms, t0, t1, y0, stepped, solver_state.inner, made_jump)
         stages = stage_distances(dense_info, t1 - t0, self.solver)
         leaves = solver_state.arrives
         # By an infinite error a solver tells that its step has failed: of infinity no derivative is a number.

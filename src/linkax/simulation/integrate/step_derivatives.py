@@ -2,8 +2,8 @@
 
 What diffrax integrates with steps chosen as it goes, is here differentiated as it was computed, with those steps given.
 Each equation of motion compiles once for its tangent and once for its cotangent, where differentiating the loop over
-steps itself needs seven copies. A step that ends at a switch ends there as parameters change too, and those after it
-move along, so that each begins as far from the kink as it did.
+steps itself needs seven copies. A step that ends at a switch, or at a known time of a law, ends there as parameters
+change too, and those after it move along, so that each begins as far from the kink as it did.
 """
 
 import functools
@@ -43,7 +43,7 @@ class Steps(NamedTuple):
 class Trajectory(NamedTuple):
     """The states of a motion that have derivatives: at saved times, at the end, at all steps where asked for.
 
-    `times`: those of the steps, of which switches move some.
+    `times`: those of the steps, of which switches and known times of laws move some.
     """
 
     saved: Float[Array, "k n"] | None
@@ -74,7 +74,8 @@ def _stages(solver, problem, t0, t1, y0):
     weights, nodes = jnp.asarray(table.weights, y0.dtype), jnp.asarray(table.nodes, y0.dtype)
 
     def stage(i, k):
-        return k.at[i].set(duration * problem.derivative(t0 + nodes[i] * duration, y0 + weights[i] @ k))
+        t = problem.stage_time(t0 + nodes[i] * duration, t1)
+        return k.at[i].set(duration * problem.derivative(t, y0 + weights[i] @ k))
 
     return lax.fori_loop(0, len(nodes), stage, jnp.zeros((len(nodes), len(y0)), y0.dtype))
 
@@ -109,7 +110,7 @@ def _step_vjp(solver: ProjectedSolver, of_problem, problem, t0, t1, dense, sides
     def stage(back, carry):
         problem_bar, t0_bar, t1_bar, y_bar, k_bar = carry
         i = len(nodes) - 1 - back
-        at = problem, t0 + nodes[i] * duration, y0 + weights[i] @ k
+        at = problem, of_problem(problem).stage_time(t0 + nodes[i] * duration, t1), y0 + weights[i] @ k
         more, t_bar, stage_bar = jax.vjp(rates, *at)[1](duration * k_bar[i])
         stretch = k[i] @ k_bar[i] / duration
         return (
@@ -135,6 +136,8 @@ def tangents_over_steps(
     """JVP of a run, step by step from the first: tangents of its states; None among `tangents` is zero."""
     y0, count = ivp.y0, cast(Any, steps.count)
     last, switching = count - 1, len(ivp.problem.sides(ivp.y0)) > 0
+    known_dot = None if tangents.problem is None else tangents.problem.times
+    moving = switching or known_dot is not None
     saves, saved = ivp.saved is not None, cast(Any, ivp.saved)
     saved_dot = cast(Any, materialise(saved, tangents.saved) if saves else None)
 
@@ -144,8 +147,12 @@ def tangents_over_steps(
     def one(carry):
         k, j, y, moves, motion = carry
         ends = steps.ts[k], steps.ts[k + 1]
-        begin_dot = jnp.where(k == 0, materialise(ivp.t0, tangents.t0), moves if switching else 0.0)
-        end_dot = jnp.where(k == last, materialise(ivp.t1, tangents.t1), moves if switching else 0.0)
+        begin_dot = jnp.where(k == 0, materialise(ivp.t0, tangents.t0), moves if moving else 0.0)
+        end_dot = moves if moving else 0.0
+        if known_dot is not None:
+            is_known, index = _known(ivp.problem, ends[1])
+            end_dot = jnp.where(is_known, known_dot[index], end_dot)
+        end_dot = jnp.where(k == last, materialise(ivp.t1, tangents.t1), end_dot)
         moved = tangents.problem, begin_dot, end_dot, motion.end
         sides = ivp.problem.sides(steps.ys[k + 1])
         at = ivp.problem, *ends, y
@@ -161,8 +168,8 @@ def tangents_over_steps(
         if saves:
             j, found = lax.while_loop(lambda carry: _reached(saved, carry[0], ends[1]), save, (j, found))
         each = lambda rows, row: rows.at[k + 1].set(row) if every else None
-        times = each(motion.times, later) if switching else motion.times
-        return k + 1, j, y, later if switching else None, Trajectory(found, y_dot, each(motion.steps, y_dot), times)
+        times = each(motion.times, later) if moving else motion.times
+        return k + 1, j, y, later if moving else None, Trajectory(found, y_dot, each(motion.steps, y_dot), times)
 
     motion = Trajectory(
         saved=jnp.zeros((len(saved), len(y0)), y0.dtype) if saves else None,
@@ -170,8 +177,14 @@ def tangents_over_steps(
         steps=jnp.zeros_like(steps.ys).at[0].set(materialise(y0, tangents.y0)) if every else None,
         times=jnp.zeros_like(steps.ts).at[0].set(materialise(ivp.t0, tangents.t0)) if every else None,
     )
-    begin = jnp.zeros((), int), jnp.zeros((), int), y0, jnp.zeros_like(ivp.t0) if switching else None, motion
+    begin = jnp.zeros((), int), jnp.zeros((), int), y0, jnp.zeros_like(ivp.t0) if moving else None, motion
     return lax.while_loop(lambda carry: carry[0] < count, one, begin)[-1]
+
+
+def _known(problem, t):
+    """Whether a step ends at a known time, and which."""
+    ends = problem.times == t
+    return jnp.any(ends), jnp.argmax(ends)
 
 
 def _reached(saved, j, t):
@@ -185,6 +198,7 @@ def cotangents_over_steps(
     """VJP of a run, step by step from the last: cotangents of the leaves of `ivp` that are `wanted`."""
     problem, fixed = eqx.partition(ivp.problem, wanted.problem)
     last, switching = cast(Any, steps.count) - 1, len(ivp.problem.sides(ivp.y0)) > 0
+    moving = switching or problem.times is not None
     saved = cast(Any, ivp.saved)
     saved_cotangent: Any = cotangent.saved
 
@@ -201,13 +215,19 @@ def cotangents_over_steps(
         j, begin_bar, end_bar, dense_bar, saved_bar = of_step
         sides = ivp.problem.sides(steps.ys[k + 1])
         more, begin_more, end_more, y_bar = _step_vjp(
-            solver, of_problem, problem, *ends, dense, sides, (moves_bar if switching else zero, y_bar), dense_bar
+            solver, of_problem, problem, *ends, dense, sides, (moves_bar if moving else zero, y_bar), dense_bar
         )
         problem_bar = jax.tree.map(jnp.add, problem_bar, more)
         begin_bar, end_bar = begin_bar + begin_more, end_bar + end_more
         t0_bar = jnp.where(k == 0, begin_bar, t0_bar)
         t1_bar = jnp.where(k == last, end_bar, t1_bar)
-        moves_bar = begin_bar + jnp.where(k == last, 0.0, end_bar) if switching else None
+        end_bar = jnp.where(k == last, 0.0, end_bar)
+        if problem.times is not None:
+            is_known, index = _known(ivp.problem, ends[1])
+            of_times = problem_bar.times.at[index].add(jnp.where(is_known, end_bar, 0.0))
+            problem_bar = eqx.tree_at(lambda problem: problem.times, problem_bar, of_times)
+            end_bar = jnp.where(is_known, 0.0, end_bar)
+        moves_bar = begin_bar + end_bar if moving else None
         return k - 1, j, y_bar, moves_bar, problem_bar, t0_bar, t1_bar, saved_bar
 
     zero = jnp.zeros((), steps.ts.dtype)
@@ -218,7 +238,7 @@ def cotangents_over_steps(
         last,
         count - 1,
         cotangent.end,
-        zero if switching else None,
+        zero if moving else None,
         jax.tree.map(jnp.zeros_like, problem),
         zero,
         zero,
