@@ -46,20 +46,69 @@ def test_no_thin_obstacle_is_passed_through(stop):
     assert np.max(speeds[:, 0]) < 9.9
 
 
-def shared(pulse):
-    return lambda t, motion: 2.0 * pulse(t)
+class Holder:
+    """An object of one's own that holds a law."""
+
+    def __init__(self, pulse):
+        self.pulse = pulse
+
+    def __call__(self, t, motion):
+        return self.pulse(t)
+
+    def push(self, t):
+        return self.pulse(t)
 
 
-@pytest.mark.parametrize("law", [lx.PiecewiseLinear, lx.Spline])
-@pytest.mark.parametrize("read", [lambda law: law, shared], ids=["the law", "a function that reads it"])
+class Pulsed(lx.AbstractForce):
+    """A force element of one's own, whose method reads a law of the module."""
+
+    @property
+    def terms(self):
+        return (lx.Term("hinge", None),)
+
+    def load(self, t, motion):
+        return motion.joint_load(self.terms[0], AREA_OF_A_HALF(t))
+
+
+AREA_OF_A_HALF = lx.PiecewiseLinear([0.0, 0.7, 0.705, 0.71, 2.0], [0.0, 0.0, 100.0, 0.0, 0.0])
+
+
+def by_a_list(pulse):
+    held = [{"pulse": pulse}]
+    return lambda t, motion: held[0]["pulse"](t)
+
+
+def by_a_method(pulse):
+    holder = Holder(pulse)
+    return lambda t, motion: (lambda s: holder.push(s))(t)
+
+
+READ = {
+    "the law": lambda pulse: pulse,
+    "a function": lambda pulse: lambda t, motion: pulse(t),
+    "a default": lambda pulse: lambda t, motion, pulse=pulse: pulse(t),
+    "a list": by_a_list,
+    "an object": Holder,
+    "a method": by_a_method,
+}
+
+
+def test_a_pulse_that_an_element_of_ones_own_reads_is_not_stepped_over():
+    run = lx.simulate(pendulum(gravity=0.0, forces=[Pulsed()]), lx.State(jnp.zeros(1), jnp.zeros(1)), t1=2.0)
+    np.testing.assert_allclose(run.end.v[0], 3.0 * 0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("law", "read"), [*((lx.PiecewiseLinear, name) for name in READ), (lx.Spline, "the law"), (lx.Spline, "a function")]
+)
 @pytest.mark.parametrize("accuracy", [lx.DRAFT, lx.PRECISE])
 def test_a_pulse_at_known_times_is_not_stepped_over(law, read, accuracy):
     """The end's speed is the area of the pulse over the inertia, at any tolerance."""
     pulse = law([0.0, 0.7, 0.705, 0.71, 2.0], [0.0, 0.0, 100.0, 0.0, 0.0])
-    arm = pendulum(gravity=0.0, forces=[lx.JointTorque("hinge", read(pulse))])
+    arm = pendulum(gravity=0.0, forces=[lx.JointTorque("hinge", READ[read](pulse))])
     run = lx.simulate(arm, lx.State(jnp.zeros(1), jnp.zeros(1)), t1=2.0, accuracy=accuracy)
     ts = np.linspace(0.0, 2.0, 2_000_001)
-    area = np.trapezoid(np.asarray(jax.vmap(pulse)(ts)), ts) * (2.0 if read is shared else 1.0)
+    area = np.trapezoid(np.asarray(jax.vmap(pulse)(ts)), ts)
     np.testing.assert_allclose(run.end.v[0], 3.0 * area, rtol=1e-6)
     assert law is lx.Spline or run.stats["num_steps"] < 20
 

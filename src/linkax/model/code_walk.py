@@ -86,19 +86,19 @@ def _is_pytree(value: Any) -> bool:
     return not jax.tree_util.all_leaves([value])
 
 
-def _all_code(code: types.CodeType) -> Iterator[types.CodeType]:
+def all_code(code: types.CodeType) -> Iterator[types.CodeType]:
     """Go through code and the code of functions in it."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
-            yield from _all_code(constant)
+            yield from all_code(constant)
 
 
 @functools.lru_cache(maxsize=1024)
 def _names(code: types.CodeType) -> tuple[set[str], set[str]]:
     """Find the names of globals and attributes that code reads, and of modules that it imports when it runs."""
     names, imported = set(), set()
-    for part in _all_code(code):
+    for part in all_code(code):
         for at in get_instructions(part):
             if at.argval in part.co_names and not at.opname.startswith(("STORE_", "DELETE_")):
                 names.add(at.argval)
