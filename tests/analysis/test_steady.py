@@ -93,6 +93,77 @@ def test_whirling_of_a_rotor():
     np.testing.assert_allclose(frequencies[3], exact, rtol=1e-8)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("stretched", [0.0, 1e-3, 100.0])
+def test_whirling_of_a_rotor_on_a_free_joint(stretched):
+    """Seen from the ground, on springs that are alike in all directions or not: M z̈ + K₁ z + K₂ u = 0 of its centre z
+    and A ü + K₂ᵀ z + K₃ u = C Ω u × of the tilt u of its axis.
+    """
+    mass, across, axial, spin, stiffness, places = 2.0, 0.05, 0.08, 20.0, (300.0, 700.0), (0.3, -0.5)
+    rotor = lx.RigidBody("rotor", mass, inertia=[across, across, axial])
+    springs = [
+        lx.Spring(lx.GROUND.at([0.0, 0.0, z]), rotor.at([0.0, 0.0, z]), k)
+        for z, k in zip(places, stiffness, strict=True)
+    ]
+    # Far away along x, which holds the centre alone.
+    far = lx.Spring(lx.GROUND.at([1e6, 0.0, 0.0]), rotor, stretched, free_length=1e6)
+    mechanism = lx.Mechanism([rotor], [lx.Free("flight", lx.GROUND, rotor)], [*springs, far])
+    at = lx.State(jnp.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, spin, 0.0, 0.0, 0.0]))
+    found = lx.linearise(mechanism, at).eigenvalues.imag
+    of_places, of_tilt = np.array(stiffness), np.array(places)
+    k = np.array([[of_places.sum(), of_places @ of_tilt], [of_places @ of_tilt, of_places @ of_tilt**2]])
+    # x, y, and the axis's components along them.
+    full = np.kron(k, np.eye(2)) + np.diag([stretched, 0.0, 0.0, 0.0])
+    turns = np.zeros((4, 4))
+    turns[2, 3], turns[3, 2] = axial * spin, -axial * spin
+    inverse = np.diag(1.0 / np.array([mass, mass, across, across]))
+    whole = np.block([[np.zeros((4, 4)), np.eye(4)], [-inverse @ full, -inverse @ turns]])
+    exact = np.linalg.eigvals(whole).imag
+    np.testing.assert_allclose(np.min(np.abs(found[:, None] - exact), axis=0), 0.0, atol=1e-4)
+
+
+def rotor_on_an_arm():
+    """A rod that hangs, with a small balanced rotor on it."""
+    arm, rotor = lx.rod("arm", 1.0, 1.0), lx.RigidBody("rotor", 0.1, inertia=[1e-4, 1e-4, 2e-4])
+    joints = [
+        lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z"),
+        lx.Revolute("spindle", arm.at([0.5, 0.0, 0.0]), rotor, axis="z"),
+    ]
+    return lx.Mechanism([arm, rotor], joints, [lx.Gravity([0.0, -9.81, 0.0])])
+
+
+@pytest.mark.slow
+def test_a_fast_rotor_does_not_hide_what_its_carrier_does():
+    mechanism = rotor_on_an_arm()
+    for spin in (1.0, 300.0, 1e4):
+        hangs = lx.linearise(mechanism, lx.State(jnp.array([-np.pi / 2, 0.0]), jnp.array([0.0, spin])))
+        assert np.max(hangs.natural_frequencies) > 3.0
+        for angle, speed in ((-np.pi / 2 + 1e-2, 0.0), (0.0, 0.0), (-np.pi / 2, 2.0)):
+            with pytest.raises(ValueError, match=r"off an equilibrium.*'hinge' accelerates|not steady"):
+                lx.linearise(mechanism, lx.State(jnp.array([angle, 0.0]), jnp.array([speed, spin])))
+
+
+@pytest.mark.slow
+def test_a_cam_in_its_dwell_is_not_steady():
+    """It lifts for 160° of a turn, and rests for the others."""
+    disc, follower = lx.RigidBody("disc", 1.0, inertia=1e-3), lx.point_mass("follower", 0.5)
+    profile = lambda angle: 0.04 + 0.01 * jnp.maximum(0.0, jnp.cos(angle - np.pi) - np.cos(1.4)) ** 3
+    joints = [
+        lx.Revolute("shaft", lx.GROUND, disc, axis="z"),
+        lx.Prismatic("stem", lx.GROUND, follower, axis="x"),
+        lx.Cam("contact", disc, follower, profile, roller_radius=0.01),
+    ]
+    drive = lx.Drive("motor", "shaft", speed=20.0)
+    mechanism = lx.Mechanism([disc, follower], joints, [lx.JointSpring("stem", stiffness=500.0)], [drive])
+    for angle in (1.65, 0.0, -1.65):
+        guess, t = {"stem": 0.05, "shaft": angle, "contact": [-angle, 0.0]}, angle / 20.0
+        state = lx.assemble(mechanism, guess=guess, t=t)
+        with pytest.raises(lx.EquilibriumError, match="no equilibrium lasts while drive 'motor' goes on"):
+            lx.equilibrium(mechanism, state, t=t)
+        with pytest.raises(ValueError, match="is not steady"):
+            lx.linearise(mechanism, state, t=t)
+
+
 def column(load):
     """Ziegler's: two rods on springs, and a force along the second one, which follows it."""
     rods = [lx.rod("lower", 1.0, 1.0), lx.rod("upper", 1.0, 1.0)]

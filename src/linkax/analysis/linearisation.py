@@ -123,9 +123,9 @@ class Linearisation(NamedTuple):
     About a steady motion, y are changes of the joints' coordinates that move with it, and frequencies are those seen
     from the rotating bodies: a rotor that whirls at ω seen from the ground whirls at ω − Ω here. Of a mechanism that
     turns as one, with bodies that spin about axes of their own, such as a disc that rolls in a circle, y turn and do
-    not spin. Centrifugal forces, and what they stiffen, are in K, gyroscopic terms in D, as its skew part.
-    `natural_frequencies` leave out the symmetric part of D, and the skew part of K, which dampers have that do not
-    rotate with the bodies.
+    not spin: of a rotor on a `Free` joint and springs frequencies are those seen from the ground. Centrifugal forces,
+    and what they stiffen, are in K, gyroscopic terms in D, as its skew part. `natural_frequencies` leave out the
+    symmetric part of D, and the skew part of K, which dampers have that do not rotate with the bodies.
 
     Differentiable, but for frequencies and eigenvalues that equal another one up to rounding, and their modes and
     eigenvectors, whose derivatives are NaN. Take one by its index: forwards, JAX's maximum spreads the NaN of others.

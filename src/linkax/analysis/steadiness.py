@@ -21,6 +21,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 
 NEAR = 1e-6  # distance from an equilibrium up to which a state counts as in it [rad, lengths of the mechanism]
+SLOW = 1e-3  # of the fastest speed: the rate that accelerations of what nothing holds are next to
 UNFELT = 1e-9  # forces that rounding leaves, relative to all forces
 CONSTANT = 1e-5  # relative change of coefficients and loops up to which they count as constant
 ROUNDING_ULPS = 1e5  # error of a stiffness, in units of rounding of the largest one
@@ -55,19 +56,23 @@ class Steadiness(NamedTuple):
         stiffness = history.by_places[0, :count, :count]
         # Distances and changes are measured in undamped modes of the symmetric stiffness.
         values, vectors = eigh((stiffness + stiffness.T) / 2.0)
-        square = jnp.maximum(jnp.abs(values), system.fastest(v) ** 2)
+        fastest = system.fastest(v)
+        square = jnp.maximum(jnp.abs(values), fastest**2)
         size = jax.vmap(system.fastest, in_axes=1)(moving.free @ vectors)
         forces = largest_force(move(configure(system, moving.t, moving.q), v))
         along = jnp.abs(history.accelerations @ vectors)
         # Parts of a force may cancel, those of internal states among them.
-        felt = along > UNFELT * (size * forces + jnp.abs(vectors.T @ states.force) @ units)
-        distance = jnp.where(felt, size * along, 0.0) / jnp.where(felt, square, 1.0)
+        unfelt = limit(UNFELT, system.dtype)
+        felt = along > unfelt * (size * forces + jnp.abs(vectors.T @ states.force) @ units)
+        # A rotor may turn a thousand times as fast as what carries it falls.
+        held = jnp.maximum(jnp.abs(values), (SLOW * fastest) ** 2)
+        distance = jnp.where(felt, size * along, 0.0) / jnp.where(felt, held, 1.0)
         worst = jnp.argmax(jnp.max(distance, axis=1, initial=0.0))
 
         # Relative to the geometric mean of two modes' stiffnesses, and beyond rounding of the stiffest one.
         barred = moving.basis.shape[1] - count
         vectors = block_diag(vectors, jnp.eye(barred, dtype=system.dtype))
-        square = jnp.concatenate([square, jnp.broadcast_to(system.fastest(v) ** 2, (barred,))])
+        square = jnp.concatenate([square, jnp.broadcast_to(fastest**2, (barred,))])
         scale = jnp.sqrt(jnp.outer(square, square))
 
         def changes(matrices, scale):

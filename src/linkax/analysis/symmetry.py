@@ -160,6 +160,8 @@ def find_turns(
 ) -> Float[Array, " m"]:
     """The smallest turns with which X accelerates as the motion does, and is a symmetry, beside the motion, too.
 
+    Where a body may turn with its slides or spin about its own axis, as a rotor on a `Free` joint, it spins.
+
     **Arguments:** `constant`: the motion, without any; `places`, `speeds`: directions in which q and v may change.
     """
     motion, topology, count = constant.speeds(q), system.topology, len(constant.turns)
@@ -196,7 +198,14 @@ def find_turns(
     # The motion itself comes first.
     of_all = lax.map(missed, jnp.pad(block_diag(unit(places), pace * unit(speeds)), ((1, 0), (0, 0))))
     each = jnp.concatenate([of_all[:1, :, 0], of_all[:, :, 1]]).transpose(0, 2, 1).reshape(-1, count + 1)
-    return -pace * _pseudo_inverse(each[:, 1:] - each[:, :1]) @ each[:, 0]
+    matrix = each[:, 1:] - each[:, :1]
+    inverse = _pseudo_inverse(matrix)
+    turns, of_slides = -pace * inverse @ each[:, 0], 3 * len(_turning_slides(topology))
+    if not of_slides:
+        return turns
+    open_ = jnp.eye(count, dtype=turns.dtype) - inverse @ matrix  # a projection: what is not one of its numbers is none
+    open_ = jnp.where(jnp.abs(open_) > jnp.finfo(turns.dtype).eps ** 0.5, open_, 0.0)
+    return turns - _pseudo_inverse(open_[:of_slides]) @ turns[:of_slides]
 
 
 def num_turns(topology: Topology) -> int:

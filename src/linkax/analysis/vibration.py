@@ -51,7 +51,7 @@ def linearise(
     **Raises:** `ValueError` for a state that is neither in equilibrium nor in steady motion. Inside JAX transformations
     nothing is raised, and the numbers are NaN.
 
-    A state in single precision counts as steady where it is so to 1e-3; eigenvalues are as accurate, next to the
+    A state in single precision counts as steady where it is so to 1e-2; eigenvalues are as accurate, next to the
     fastest rate.
     """
     state = checked_state(mechanism, state)
