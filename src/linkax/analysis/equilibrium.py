@@ -29,6 +29,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, evaluate_now
+from linkax.xla.undefined import nan_where
 from linkax.xla.users_line import warn
 
 BALANCED_STEP = 1e-8  # last step above which the search has failed [rad, lengths of the mechanism]
@@ -105,8 +106,8 @@ def equilibrium(mechanism: Mechanism, state: State, *, t: ArrayLike = 0.0) -> St
         # Concrete inside transformations too: whoever reads the state sees that nothing moves.
         reached = dataclasses.replace(reached, v=evaluate_now(jnp.zeros, reached.v.shape, reached.v.dtype))
     if not all_concrete((reached, ending)):
-        q = marked(mechanism, jnp.where(ending.is_sound, reached.q, jnp.nan))
-        return dataclasses.replace(reached, q=q)
+        q = nan_where(jnp.logical_not(ending.is_sound), reached.q, (mechanism, t))
+        return dataclasses.replace(reached, q=marked(mechanism, q))
     _check_steady(mechanism, ending, reached, t)
     if not ending.gap <= CLOSED:
         raise EquilibriumError(

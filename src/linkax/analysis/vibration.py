@@ -26,7 +26,7 @@ from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array
 from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, concrete
-from linkax.xla.undefined import undefined_where
+from linkax.xla.undefined import nan_where, undefined_where
 
 
 def linearise(
@@ -67,8 +67,8 @@ def linearise(
     if concrete(counted) is not None and counted != asked:
         raise ValueError(f"degrees_of_freedom is {asked}; the mechanism has {counted} here: give that, or leave it out")
     if not all_concrete((linearisation, steadiness)):
-        mark = lambda leaf: jnp.where(steadiness.is_steady, leaf, jnp.nan)
-        return marked(mechanism, jax.tree.map(mark, linearisation))
+        unsteady = jnp.logical_not(steadiness.is_steady)
+        return marked(mechanism, nan_where(unsteady, linearisation, (mechanism, state, t)))
     if not np.all(np.isfinite(linearisation.natural_frequencies)):
         system = system_of(mechanism, state.q.dtype)
         massless = massless_bodies(system, TangentSpace().prepared(system.dtype), t, state.q)

@@ -17,9 +17,19 @@ from linkax.xla.primitives import primitive
 
 def infinite_where(missing: Bool[Array, "*rows"], values: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
     """Infinity in rows of `values` that are missing, with undefined derivatives by `inputs`, see `undefined_where`."""
+    return _missing(missing, values, inputs, jnp.inf)
+
+
+def nan_where(missing: Bool[Array, ""], values: PyTree[Array], inputs: PyTree) -> PyTree:
+    """NaN in place of all floating-point `values` that are missing, with undefined derivatives by `inputs`."""
+    numbers, others = eqx.partition(values, eqx.is_inexact_array)
+    return eqx.combine(_missing(missing, numbers, inputs, jnp.nan), others)
+
+
+def _missing(missing, values, inputs, mark):
     across = lambda value: missing.reshape(missing.shape + (1,) * (value.ndim - missing.ndim))
     undefined = jax.tree.map(across, values)
-    masked = jax.tree.map(lambda none, value: jnp.where(none, jnp.inf, value), undefined, values)
+    masked = jax.tree.map(lambda none, value: jnp.where(none, mark, value), undefined, values)
     return undefined_where(undefined, masked, inputs)
 
 

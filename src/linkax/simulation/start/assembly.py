@@ -38,6 +38,7 @@ from linkax.xla.arrays import Array
 from linkax.xla.program import Program
 from linkax.xla.static_scatter import scatter_static
 from linkax.xla.tracing import all_concrete, is_first, jit_inline, without_derivatives
+from linkax.xla.undefined import undefined_where
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import compiling
 
@@ -89,8 +90,8 @@ def assemble(
 
     **Raises:** `AssemblyError` naming the joint and the remaining gap [m or rad] where a loop cannot be closed, with
     what is held, by drives too; or the joints whose motion branches where the speeds lie on no branch; `ValueError` for
-    an unknown joint or a wrong number. Inside JAX transformations nothing is raised: the speeds are infinite then, and
-    `linkax.simulate` says so in its result.
+    an unknown joint or a wrong number. Inside JAX transformations nothing is raised: the speeds are infinite then,
+    derivatives NaN, and `linkax.simulate` says so in its result.
     Warns (`AssemblyWarning`), outside JAX transformations, of beams that the loops strain; of speeds that fit several
     branches; of angles beyond one and a half turns, which may be degrees, but of joints whose turns a force or a
     constraint counts; where no guess is given, of slides between moving bodies with lengths of both signs, and of
@@ -111,7 +112,7 @@ def assemble(
     # Without the joints that only measured.
     state = State(state.q, state.v, mechanism.topology, initial_values(mechanism.forces, state.q.dtype))
     if not all_concrete((state, remainder)):
-        return _marked(mechanism, state, remainder)
+        return _marked(mechanism, state, remainder, given)
     remainder = jax.tree.map(np.asarray, remainder)
     if told := unmet(mechanism, state, t, remainder, held, moving):
         raise AssemblyError(told)
@@ -143,10 +144,11 @@ def _open_speeds(mechanism, measured, speeds, t, state):
 
 
 @jit_inline
-def _marked(mechanism, state, remainder):
-    """The state, with infinite speeds where it is none."""
-    v = jnp.where(remainder.is_met() & sound_numbers(mechanism), state.v, jnp.inf)
-    return dataclasses.replace(state, v=v)
+def _marked(mechanism, state, remainder, given):
+    """The state, with infinite speeds and without derivatives where it is none."""
+    missing = jnp.logical_not(remainder.is_met() & sound_numbers(mechanism))
+    q, v = undefined_where((missing, missing), (state.q, jnp.where(missing, jnp.inf, state.v)), given)
+    return dataclasses.replace(state, q=q, v=v)
 
 
 def _assembled(*given):

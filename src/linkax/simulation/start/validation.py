@@ -24,6 +24,7 @@ from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
 from linkax.xla.kept import kept_while_alive
 from linkax.xla.tracing import concrete
+from linkax.xla.undefined import nan_where
 
 # What a user may give for joints, by their names, or by (name, index of a speed).
 JointNumbers = (
@@ -81,10 +82,7 @@ def sound_numbers(mechanism: Mechanism) -> Bool[Array, ""] | np.bool_:
 def marked(mechanism: Mechanism, found: Tree) -> Tree:
     """Replace results of a mechanism by NaN where `sound_numbers` is false."""
     sound = sound_numbers(mechanism)
-    if concrete(sound):
-        return found
-    mark = lambda leaf: jnp.where(sound, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
-    return jax.tree.map(mark, found)
+    return found if concrete(sound) else nan_where(jnp.logical_not(sound), found, mechanism)
 
 
 def checked_time(entry: Any, name: str) -> Float[Array, ""]:
