@@ -1,12 +1,19 @@
 """Functions compared by what they compute: the same made anew, others where anything that they read is another."""
 
 import collections
+import contextvars
 import dataclasses
+import fractions
 import functools
+import inspect
 import math
+import operator
 import os
+import sys
 import threading
 import types
+import weakref
+from enum import Enum
 
 import equinox as eqx
 import jax
@@ -99,6 +106,78 @@ class Other(dict):
         return self[name]
 
 
+class Geared(Motor):
+    made = 0
+
+    def __init__(self, speed):
+        Geared.made += 1
+        super().__init__(speed)
+
+    def turn(self, t):
+        return super().turn(t)
+
+
+@dataclasses.dataclass
+class Gain:
+    speed: float = 2.0
+
+
+class Plain:
+    __match_args__ = ("speed",)
+
+
+class Converted(eqx.Module):
+    speed: float = eqx.field(converter=at_speed)
+
+
+class Mode(Enum):
+    FAST = np.array([2.0])
+
+
+class Saved:
+    __slots__ = ("speed",)
+
+    def __getstate__(self):
+        return None
+
+
+class Ratio(fractions.Fraction):
+    pass
+
+
+@functools.singledispatch
+def dispatched(t):
+    return 2.0 * t
+
+
+def matched(value):
+    def law(t):
+        match value:
+            case Plain(speed=found):
+                return found * t
+
+    return law
+
+
+def matched_in_place(value):
+    def law(t):
+        match value:
+            case Plain(found):
+                return found * t
+
+    return law
+
+
+def of_class(meta=type, **methods):
+    return meta("Own", (), methods)
+
+
+def with_speed(value):
+    value.speed = 2.0
+    return value
+
+
+_, LINEAR = jax.linearize(jnp.sin, 1.0)
 MADE = {
     "no variables": lambda: lambda t: 2.0 * jnp.sin(math.pi * t),
     "a number": lambda: scaled(2.0),
@@ -122,6 +201,12 @@ MADE = {
     "many numbers": lambda: (lambda values: lambda t: values[0] * t)([0.0] * 20_000),
     "an object of a library": lambda: (lambda queue: lambda t: queue[0] * t)(collections.deque([2.0])),
     "slots": lambda: (lambda slots: lambda t: slots.speed * t)(Slots(2.0)),
+    "a class": lambda: lambda t: Motor(Gain().speed).turn(t),
+    "a pattern": lambda: matched(with_speed(Plain())),
+    "an enumeration": lambda: lambda t: Mode["FAST"].value[0] * t,
+    "a function by the type of what it is given": lambda: lambda t: dispatched(t),
+    "what cannot be written to": lambda: (lambda table: lambda t: table["k"] * t)(types.MappingProxyType({"k": 2.0})),
+    "a linearised function": lambda: lambda t: LINEAR(t),
 }
 
 
@@ -130,8 +215,8 @@ def test_a_function_made_anew_is_the_same(made):
     (one, numbers), (other, others) = Code.of(made()), Code.of(made())
     assert one == other
     assert hash(one) == hash(other)
-    assert not one.has_changed()
     np.testing.assert_array_equal(one.with_numbers(numbers)(0.3), made()(0.3))
+    assert not one.has_changed()
     assert len(numbers) == len(others)
 
 
@@ -174,6 +259,13 @@ REFUSED = {
     "within": (lambda: within({"of": [types.SimpleNamespace(lock=threading.Lock())]}), r"values\.of\.lock, a _thread"),
     "too much": (lambda: _reading([0.0] * 200_000), "value, more than 100000 values"),
     "anything": (lambda: lambda t: globals()["SPEED"] * t, "globals, by which code can read anything"),
+    "a frame": (lambda: lambda t: sys._getframe().f_globals["SPEED"], "f_globals, by which code can read anything"),
+    "anything by another name": (lambda: (lambda read: lambda t: read()["SPEED"])(globals), "read.globals, by which"),
+    "a weak reference": (lambda: _reading(weakref.ref(MOTOR)), r"value, a weakref\.ReferenceType, which cannot"),
+    "weak references": (lambda: _reading(weakref.WeakSet([MOTOR])), r"value, a _weakrefset\.WeakSet, which cannot"),
+    "of a context": (lambda: _reading(contextvars.ContextVar("k")), r"value, a _contextvars\.ContextVar, which cannot"),
+    "memory": (lambda: _reading(memoryview(bytearray(1))), r"value, a builtins\.memoryview, which cannot"),
+    "within a function of JAX's": (lambda: _reading(jax.grad(scaled(threading.Lock()))), "value.*factor, a _thread"),
 }
 
 
@@ -193,6 +285,10 @@ def test_one_that_changes_what_it_reads_is_refused_when_it_is_called_again():
 def _closed_over(change):
     values = {"of": [2.0], "by": 3.0}
     return deep(values), lambda _: change(values)
+
+
+def _changes(value, law, change=lambda value: setattr(value, "speed", 3.0)):
+    return law(value), lambda _: change(value)
 
 
 ARRAY, MOTOR = np.arange(3.0), Motor(2.0)
@@ -217,6 +313,59 @@ CHANGES = {
     "a compiled one": (lambda t: COMPILED(t), lambda patch: patch.setitem(globals(), "SPEED", 3.0)),
     "a class of a pytree": (Wave(jnp.array(2.0)), lambda patch: patch.setattr(Wave, "__call__", lambda self, t: t)),
     "a global that a method reads": (Motor(4.0).turn, lambda patch: patch.setitem(globals(), "SPEED", 3.0)),
+}
+FASTER = lambda patch: patch.setitem(globals(), "SPEED", 3.0)
+# Methods that Python calls, of a class of which code may make objects.
+METHODS = ("__init__", "__new__", "__post_init__", "__class_getitem__", "__eq__", "__hash__", "__str__", "__setattr__")
+CHANGES |= {name: (scaled(of_class(**{name: at_speed})), FASTER) for name in METHODS}
+META = type("Meta", (type,), {"__call__": at_speed, "speed": property(at_speed)})
+CHANGES |= {
+    "a method that is compiled": (scaled(of_class(__call__=jax.jit(at_speed))()), FASTER),
+    "a default of a class": (lambda t: Gain(), lambda patch: patch.setattr(Gain.__init__, "__defaults__", (3.0,))),
+    "a converter of a field": (lambda t: Converted(t), FASTER),
+    "a method that super reads": (Geared(2.0).turn, lambda patch: patch.setattr(Motor, "gear", 1.0)),
+    "a call of a metaclass": (scaled(of_class(META)), FASTER),
+    "an attribute of a metaclass": ((lambda kind: lambda t: kind.speed)(of_class(META)), FASTER),
+    "an attribute in a pattern": _changes(with_speed(Plain()), matched),
+    "an attribute by its place in a pattern": _changes(with_speed(Plain()), matched_in_place),
+    "an attribute by a format": _changes(
+        with_speed(Plain()), lambda value: (lambda text: lambda t: text.format(value))("{0.speed}")
+    ),
+    "that there is an attribute": _changes(
+        with_speed(Plain()), lambda value: lambda t: hasattr(value, "speed"), lambda value: delattr(value, "speed")
+    ),
+    "a value of an enumeration": (MADE["an enumeration"](), lambda _: Mode.FAST.value.__setitem__(0, 3.0)),
+    "an attribute of a member": _changes(with_speed(Mode.FAST), lambda mode: lambda t: mode.speed),
+    "slots of what saves none": _changes(with_speed(Saved()), lambda saved: lambda t: saved.speed),
+    "an attribute of a number": _changes(with_speed(Ratio(1)), lambda ratio: lambda t: ratio.speed),
+    "what is in a frozen set": _changes(
+        Motor(2.0), lambda motor: (lambda motors: lambda t: sum(each.speed for each in motors))(frozenset([motor]))
+    ),
+    "a method of a list": _changes([2.0], lambda values: scaled(values.__len__), lambda values: values.append(3.0)),
+    "what is behind a view": _changes(
+        {"k": 2.0}, lambda table: scaled(types.MappingProxyType(table)), lambda table: table.update(k=3.0)
+    ),
+    "a function for a type": (
+        MADE["a function by the type of what it is given"](),
+        lambda _: dispatched.register(float)(abs),
+    ),
+}
+READERS = {
+    "attrgetter": lambda value: operator.attrgetter("speed"),
+    "methodcaller": lambda value: operator.methodcaller("turn", 1.0),
+    "getattr": lambda value: getattr,
+    "a partial of getattr": lambda value: functools.partial(getattr, value, "speed"),
+    "getattr_static": lambda value: inspect.getattr_static,
+    "vars": lambda value: vars,
+    "__getattribute__": lambda value: value.__getattribute__,
+    "object.__getattribute__": lambda value: object.__getattribute__,
+    "format": lambda value: "{0.speed}".format,
+}
+CHANGES |= {
+    f"an attribute by {name}": _changes(
+        with_speed(Plain()), lambda value, made=made: (lambda read: lambda t: read(value))(made(value))
+    )
+    for name, made in READERS.items()
 }
 
 
@@ -250,6 +399,12 @@ def test_what_code_does_not_name_may_change():
     motor = Motor(2.0)
     code, _ = Code.of(motor.turn)
     motor.last, settings.other = object(), None
+    assert not code.has_changed()
+
+
+def test_what_making_other_objects_changes_is_not_seen():
+    code, _ = Code.of(Geared(2.0).turn)
+    Geared(3.0)
     assert not code.has_changed()
 
 

@@ -128,6 +128,16 @@ class Constant(lx.AbstractForce):
         return motion.joint_load(self.terms[0], jnp.asarray(TORQUE if self.of is None else self.of.torque))
 
 
+class Read:
+    def __init__(self):
+        self.torque = TORQUE
+
+
+class Making(Constant):
+    def load(self, t, motion):
+        return motion.joint_load(self.terms[0], jnp.asarray(Read().torque))
+
+
 class Law(lx.ContactLaw):
     def elastic_force(self, depth):
         return TORQUE * depth
@@ -163,6 +173,7 @@ ARM = lx.rod("arm", 1.0, 1.0)
 OWN = {
     "a force": lambda: pendulum(forces=[Constant("hinge")]),
     "a field of a force": lambda: pendulum(forces=[Constant("hinge", SETTINGS)]),
+    "an object that a force makes": lambda: pendulum(forces=[Making("hinge")]),
     "a part of a force": lambda: pendulum(
         forces=[lx.Contact(lx.Sphere(ARM.at("tip"), 0.1), lx.Plane(lx.GROUND), Law(1e5))]
     ),

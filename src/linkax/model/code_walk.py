@@ -2,10 +2,13 @@
 
 import abc
 import builtins
+import copyreg
+import dataclasses
 import functools
 import sys
 import types
 import typing
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dis import get_instructions
@@ -56,17 +59,24 @@ _ATOMS = (type(None), bool, int, float, complex, str, bytes, type(...), range)
 # What keeps results of a function, or what was traced of it.
 _KEEPING: tuple[Any, ...] = (type(jax.jit(abs)), type(eqx.filter_jit(abs)), type(functools.cache(abs)))
 # Compared by identity, as JAX does, and by the functions that they are made of.
-_OPAQUE: tuple[Any, ...] = (*_KEEPING, np.ufunc, type(np.dot), jnp.ufunc, jax.custom_jvp, jax.custom_vjp, Enum)
-_OPAQUE += (types.MemberDescriptorType, types.GetSetDescriptorType)
+_OPAQUE: tuple[Any, ...] = (*_KEEPING, np.ufunc, type(np.dot), jnp.ufunc, jax.custom_jvp, jax.custom_vjp)
+_UNBOUND = (types.WrapperDescriptorType, types.MethodDescriptorType, types.ClassMethodDescriptorType)
+_OPAQUE += (*_UNBOUND, types.MemberDescriptorType, types.GetSetDescriptorType)
+_BOUND = (types.BuiltinFunctionType, types.MethodWrapperType)
 _MADE_OF = ("__wrapped__", "jvp", "fwd", "bwd")
+# These change by themselves.
+_WEAK = (weakref.WeakKeyDictionary, weakref.WeakValueDictionary, weakref.WeakSet)
 _BASES = (object, abc.ABC, typing.Generic, typing.Protocol, types.SimpleNamespace)
 # Functions that read by names which are in no code: of what is given to them, and of anything.
-_BY_NAME = {"getattr", "vars", "__dict__", "attrgetter", "methodcaller", "asdict", "astuple", "fields", "copy"}
-_BY_NAME |= {"deepcopy", "__getattribute__"}
-_ANYTHING = {"globals", "eval", "exec", "__import__", "import_module"}
-_UNCALLED = {"__init__", "__new__", "__post_init__", "__init_subclass__", "__setattr__", "__repr__", "__str__"}
-_UNCALLED |= {"__eq__", "__hash__"}
+_BY_NAME = {"getattr", "hasattr", "vars", "dir", "__dict__", "__getattribute__", "attrgetter", "methodcaller"}
+_BY_NAME |= {"getattr_static", "getmembers", "asdict", "astuple", "fields", "copy", "deepcopy", "format", "format_map"}
+_ANYTHING = {"globals", "eval", "exec", "__import__", "import_module", "__globals__", "f_globals", "f_locals"}
+_FUNCTIONS = (types.FunctionType, *_BOUND, *_UNBOUND, type)
+# What makes an object, and names by which code reaches it from another object.
+_MAKING = {"__init__", "__new__", "__post_init__", "__check_init__"}
+_MADE_ANEW = {"type", "__class__", "replace"}
 _ALL = "*"  # in place of names: what is reached is read whole
+_HOLDING = (functools.partial, types.MethodType)
 _MOST_PARTS = 100_000
 
 
@@ -104,9 +114,17 @@ def _names(code: types.CodeType) -> tuple[set[str], set[str]]:
                 names.add(at.argval)
             if at.opname == "IMPORT_NAME":
                 imported.add(at.argval)
+            if at.opname == "MATCH_CLASS":  # of attributes that are among the constants
+                texts = {text for constant in part.co_consts if isinstance(constant, tuple) for text in constant}
+                names |= {"__match_args__", *(text for text in texts if isinstance(text, str))}
+    return names | _read_by(names), imported
+
+
+def _read_by(names: set[str]) -> set[str]:
+    """Find what functions of these names read, besides what code names."""
     if names & _ANYTHING:
         raise NotComparable("by which code can read anything", (min(names & _ANYTHING),))
-    return names | {_ALL} if names & _BY_NAME else names, imported
+    return {_ALL} if names & _BY_NAME else set()
 
 
 class Walk:
@@ -114,14 +132,15 @@ class Walk:
 
     Each part gives a key, which compares it, and a `Maker`.
 
-    - `names`: names in all code met so far. `variables`: of a user's that functions close over or read as globals.
+    - `names`: names in all code met so far, and a user's classes that it reads, of which it may make objects.
+    - `variables`: of a user's that functions close over or read as globals.
     - `numbers`: numbers met so far. `keeping`: functions of `jax.jit` and `functools.cache`.
     """
 
-    def __init__(self, names: Iterable[str]) -> None:
+    def __init__(self, names: Iterable[Any]) -> None:
         self.names, self.numbers, self.variables, self.keeping = set(names), [], {}, []
         self._attributes, self._around, self._count, self._is_traced = frozenset(names), [], 0, True
-        self._classes = set()
+        self._classes, self._is_kept = set(), False
 
     def part(self, value: Any, is_explicit: bool = False) -> tuple[Any, Maker]:
         """Find the key and the maker of a value; where `is_explicit`, its floats and NumPy arrays are numbers too.
@@ -135,22 +154,20 @@ class Walk:
         if is_number and self._is_traced:
             self.numbers.append(value)
             return "number", next
+        if isinstance(value, _FUNCTIONS):
+            self.names |= _read_by({value.__name__})
         if (key := self._atom(value)) is not None:
             return key, lambda _: value
+        if isinstance(value, type) and self._is_read(value):
+            self.names.add(value)
         for place, around in enumerate(self._around):
             if around is value:
                 if self._is_traced:
                     raise NotMadeAgain
                 return ("again", place), lambda _: value
         self._around.append(value)
-        numbers = len(self.numbers)
         try:
             return self._compound(value, is_explicit)
-        except NotComparable:
-            if not (isinstance(value, types.FunctionType) and is_library(value)):
-                raise
-            del self.numbers[numbers:]
-            return Same(value), lambda _: value
         finally:
             self._around.pop()
 
@@ -161,6 +178,11 @@ class Walk:
             return self.part(value)[0]
         finally:
             self._is_traced = traced
+
+    def _is_read(self, kind: type) -> bool:
+        """Tell whether code reads a class by a name, not as the class of an instance or the one that `super` reads."""
+        around = self._around[-1] if self._around else None
+        return type(around) is not kind and not (type(around) is dict and around.get("__class__") is kind)
 
     def _atom(self, value: Any) -> Any:
         if isinstance(value, Key):
@@ -203,7 +225,7 @@ class Walk:
         kind = type(value)
         if isinstance(value, _OPAQUE):
             return self._opaque(value)
-        if kind is types.BuiltinFunctionType:
+        if kind in _BOUND:
             return kind, value.__name__, self.key(value.__self__)
         if kind in (staticmethod, classmethod):
             return kind, self.key(value.__func__)
@@ -211,13 +233,16 @@ class Walk:
             return kind, self.key([value.fget, value.fset])
         if kind is functools.cached_property:
             return kind, self.key(value.func)
+        if kind is types.MappingProxyType:
+            return kind, self.key(dict(value))
         if isinstance(value, types.ModuleType):
             return Same(value), self._settings(value) if is_library(value) else self._read(value)
         if not isinstance(value, type):
             return self._instance(value)
         if value in self._classes:  # of many instances
             return Same(value)
-        read = self._read(value)
+        members = value.__members__.values() if issubclass(value, Enum) else ()  # reached without their names
+        read = self._read(value), self.key(list(members))
         self._classes.add(value)
         return Same(value), read
 
@@ -258,7 +283,8 @@ class Walk:
             for space in (vars(builtins), function.__globals__, modules)
         ]
         if of_user:
-            self.variables |= dict.fromkeys((*closed_over, *(name for name in read[1] if not _is_fixed(read[1][name]))))
+            own = (name for space in (closed_over, read[1]) for name in space if not _is_fixed(space[name]))
+            self.variables |= dict.fromkeys(name for name in own if name != "__class__")
         key, maker = self.part((closed_over, function.__defaults__, function.__kwdefaults__))
         others = {name: value for name, value in vars(function).items() if name != "__wrapped__"}
 
@@ -280,25 +306,48 @@ class Walk:
 
     def _instance(self, value: Any) -> Any:
         kind = type(value)
-        if kind is object:
+        if kind is object or (isinstance(value, Enum) and is_library(kind)):
             return Same(value)
-        if is_library(kind) and kind.__hash__ not in (None, object.__hash__):
-            with suppress(TypeError):
-                return kind, hash(value), value  # such do not change
-        bases = [base for base in kind.__mro__ if base not in _BASES]
-        by_attributes = hasattr(value, "__dict__") and not any(is_library(b) or "__slots__" in vars(b) for b in bases)
-        return self.key(kind), self._read(value) if by_attributes else self._reduced(value)
+        if isinstance(value, Enum):
+            return Same(value), self.key(kind), self.key(value._value_), self._read(value)
+        if (key := _compared(value)) is not None:
+            return key
+        if not is_library(kind):
+            of_library = any(is_library(base) for base in kind.__mro__ if base not in _BASES)
+            return self.key(kind), self._read(value), self._reduced(value) if of_library else None
+        if self._is_kept or not self._is_of_library():
+            return self._reduced(value)
+        self._is_kept = True
+        try:
+            return self._reduced(value)
+        except NotComparable:
+            return Same(value)
+        finally:
+            self._is_kept = False
+
+    def _is_of_library(self) -> bool:
+        """Tell whether a function of a library holds what is walked through now, so that no user changes it."""
+        holders = (each for each in reversed(self._around[:-1]) if not (_is_pytree(each) or type(each) in _HOLDING))
+        holder = next(holders, None)
+        return isinstance(holder, types.FunctionType) and is_library(holder)
 
     def _reduced(self, value: Any) -> Any:
         """Find the key of all that a copy of an object would be made of."""
         kind = type(value)
+        told = f"a {kind.__module__}.{kind.__qualname__}, which cannot be compared"
+        if isinstance(value, _WEAK):
+            raise NotComparable(told)
+        reduce = copyreg.dispatch_table.get(kind, lambda value: value.__reduce_ex__(4))
         try:
-            parts = value.__reduce_ex__(4)
+            reduced = reduce(value)
         except Exception as error:
-            raise NotComparable(f"a {kind.__module__}.{kind.__qualname__}, which cannot be compared") from error
-        if isinstance(parts, str):  # there is one
+            raise NotComparable(told) from error
+        if isinstance(reduced, str):  # there is one
             return Same(value)
-        return self.key([list(part) if isinstance(part, Iterator) else part for part in parts])
+        parts: list[Any] = [list(part) if isinstance(part, Iterator) else part for part in reduced]
+        if not is_library(kind):  # which no code reads here
+            parts[:2] = [Same(kind) if each is kind else each for each in (parts[0], *parts[1])]
+        return self.key(parts)
 
     def _settings(self, library: types.ModuleType) -> Any:
         """Find the key of what code names in a library that is no function, such as `os.environ`."""
@@ -313,18 +362,58 @@ class Walk:
     def _read(self, space: Any) -> Any:
         """Find the key of attributes of a module, class or instance that code names, or calls as operators."""
         is_class = isinstance(space, type)
-        owners = [base for base in (space if is_class else type(space)).__mro__ if not is_library(base)]
-        spaces = owners if is_class else [space]
-        reads_all = _ALL in self._attributes or any("__getattr__" in vars(owner) for owner in (*owners, *spaces))
-        found = {}
-        for entries in map(vars, reversed(spaces)):
-            for name, value in list(entries.items()):
+        bases = (*(space if is_class else type(space)).__mro__, *type(space).__mro__)
+        classes = [base for base in bases if not is_library(base)]
+        spaces = [(each, vars(each)) for each in classes] if is_class else [(type(space), _held(space))]
+        has_getattr = any("__getattr__" in entries for entries in (*map(vars, classes), *(held for _, held in spaces)))
+        reads_all = has_getattr or _ALL in self._attributes
+        makes = is_class and not self._attributes.isdisjoint({space, *_MADE_ANEW})
+        found = []
+        for owner, entries in spaces:
+            of_making = {*_MAKING, "__call__"} if issubclass(owner, type) else _MAKING
+            found.append({})
+            for name, value in sorted(entries.items()):
                 is_special = name[:2] == "__" == name[-2:]
-                is_operator = is_special and name not in _UNCALLED and isinstance(value, types.FunctionType)
+                is_operator = is_special and (makes or name not in of_making) and _is_called(value)
                 is_read = name in self._attributes or (reads_all and not is_special and name != "_abc_impl")
                 if is_operator or is_read:
-                    found[name] = value
-        return self.key(dict(sorted(found.items())))
+                    found[-1][name] = value
+        if is_class and "__match_args__" in self._attributes:
+            self.names.update(getattr(space, "__match_args__", ()))
+        if makes and dataclasses.is_dataclass(space):
+            found.append([dict(field.metadata) for field in dataclasses.fields(space)])  # where Equinox has converters
+        return self.key(found)
+
+
+def _compared(value: Any) -> Any:
+    """The key of code, and of an object of an installed package that is equal by value; None of others.
+
+    Of Python's own, sets and weak references are equal by what they hold, which changes.
+    """
+    kind = type(value)
+    is_equal_by_value = kind.__hash__ not in (None, object.__hash__) and kind.__eq__ is not object.__eq__
+    of_python = kind.__module__.partition(".")[0] in sys.stdlib_module_names
+    of_package = is_library(kind) and not (of_python or callable(value))
+    if kind is types.CodeType or (is_equal_by_value and of_package):
+        with suppress(TypeError):
+            return kind, hash(value), value
+    return None
+
+
+def _is_called(value: Any) -> bool:
+    """Tell whether Python calls this where it is an attribute of a class."""
+    return callable(value) or hasattr(type(value), "__get__")
+
+
+def _held(value: Any) -> dict[str, Any]:
+    """Attributes that a module or an instance has itself, those in slots too."""
+    held = dict(vars(value)) if hasattr(value, "__dict__") else {}
+    for base in type(value).__mro__:
+        for name, member in () if is_library(base) else vars(base).items():
+            if isinstance(member, types.MemberDescriptorType):
+                with suppress(AttributeError):  # it has no value
+                    held[name] = member.__get__(value)
+    return held
 
 
 def _is_fixed(value: Any) -> bool:
