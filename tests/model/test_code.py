@@ -134,6 +134,15 @@ class Mode(Enum):
     FAST = np.array([2.0])
 
 
+class Fast:
+    def __init__(self):
+        self.speed = SPEED
+
+    @classmethod
+    def anew(cls):
+        return cls()
+
+
 class Saved:
     __slots__ = ("speed",)
 
@@ -142,6 +151,10 @@ class Saved:
 
 
 class Ratio(fractions.Fraction):
+    pass
+
+
+class Size(np.float64):
     pass
 
 
@@ -324,6 +337,8 @@ CHANGES |= {
     "a default of a class": (lambda t: Gain(), lambda patch: patch.setattr(Gain.__init__, "__defaults__", (3.0,))),
     "a converter of a field": (lambda t: Converted(t), FASTER),
     "a method that super reads": (Geared(2.0).turn, lambda patch: patch.setattr(Motor, "gear", 1.0)),
+    "an object made by a method of a class": ((lambda fast: lambda t: fast.anew().speed)(Fast()), FASTER),
+    "an object made by the class of another": ((lambda fast: lambda t: type(fast)().speed)(Fast()), FASTER),
     "a call of a metaclass": (scaled(of_class(META)), FASTER),
     "an attribute of a metaclass": ((lambda kind: lambda t: kind.speed)(of_class(META)), FASTER),
     "an attribute in a pattern": _changes(with_speed(Plain()), matched),
@@ -338,6 +353,7 @@ CHANGES |= {
     "an attribute of a member": _changes(with_speed(Mode.FAST), lambda mode: lambda t: mode.speed),
     "slots of what saves none": _changes(with_speed(Saved()), lambda saved: lambda t: saved.speed),
     "an attribute of a number": _changes(with_speed(Ratio(1)), lambda ratio: lambda t: ratio.speed),
+    "an attribute of a number of NumPy's": _changes(with_speed(Size(1)), lambda size: lambda t: size.speed),
     "what is in a frozen set": _changes(
         Motor(2.0), lambda motor: (lambda motors: lambda t: sum(each.speed for each in motors))(frozenset([motor]))
     ),

@@ -124,7 +124,7 @@ def _read_by(names: set[str]) -> set[str]:
     """Find what functions of these names read, besides what code names."""
     if names & _ANYTHING:
         raise NotComparable("by which code can read anything", (min(names & _ANYTHING),))
-    return {_ALL} if names & _BY_NAME else set()
+    return names & _MADE_ANEW | ({_ALL} if names & _BY_NAME else set())
 
 
 class Walk:
@@ -189,7 +189,7 @@ class Walk:
             return value
         if type(value) in _ATOMS or isinstance(value, np.dtype):
             return type(value), repr(value)  # tells 0.0 from -0.0, and 1 from 1.0
-        if isinstance(value, np.generic) or type(value) is np.ndarray:
+        if (isinstance(value, np.generic) and is_library(type(value))) or type(value) is np.ndarray:
             return None if value.dtype.hasobject else (type(value), repr(value.dtype), value.shape, value.tobytes())
         if isinstance(value, jax.Array):
             return Same(value)
@@ -378,6 +378,8 @@ class Walk:
                 is_read = name in self._attributes or (reads_all and not is_special and name != "_abc_impl")
                 if is_operator or is_read:
                     found[-1][name] = value
+                if is_read and isinstance(value, classmethod):  # which is given the class
+                    self.names.add(space)
         if is_class and "__match_args__" in self._attributes:
             self.names.update(getattr(space, "__match_args__", ()))
         if makes and dataclasses.is_dataclass(space):
