@@ -46,7 +46,7 @@ SETTLED_ENDS = "converged", "stopped early"
 AT_END = 1e-4  # of the range between bounds, up to which a number is on one, of a loss
 SETTLED = 1e-2  # relative change of the noise of sensors, from which on it stays as it is found
 ROUNDS = 10  # of finding it
-THERE = 1e-5  # change of a free number, up to which a search was where it ended
+THERE = 1e-5  # change of a free number, relative to its magnitude, up to which a search was where it ended
 FAR = 0.1  # from a minimum, in standard errors, up to which a search may have converged
 DEFAULT_RATE = 0.02  # of Adam, in parameters that all start near one
 NO_MINIMUM = {
@@ -245,7 +245,8 @@ def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> F
         worth = laboratory.worth(errors, args[0], slopes)
         there[:count], factors[:count], scatter = errors.there, worth.factors, worth.scatter
     count = int(np.sum(there[:count]))
-    residual, slopes = residual[there], (factors[:, None] * slopes)[there]
+    seen = pulled | ~_hidden(search.free, z, residual, slopes)
+    residual, slopes = residual[there], (factors[:, None] * np.where(seen, slopes, 0.0))[there]
     result = _without_covariance(search, z, loss, residual[:count], losses, ended)
     if laboratory is not None:
         result = result._replace(
@@ -271,10 +272,18 @@ def _beyond_bounds(free, z, residual, slopes) -> Bool[np.ndarray, " p"]:
     gradient, sizes = slopes.T @ residual, np.linalg.norm(slopes, axis=0)
     lower, upper = map(np.asarray, free.ends)
     way = np.where(gradient > 0.0, np.minimum(z - lower, free.longest), upper - z)
-    beyond = np.abs(gradient) / np.maximum(way, NEAREST) > sizes**2
+    # Where no step leads closer to a bound, a number that is pulled there is on it.
+    beyond = (gradient != 0.0) & ((way <= NEAREST) | (np.abs(gradient) / np.maximum(way, NEAREST) > sizes**2))
     # A logarithm that fell has lost its influence by that.
     fell = np.isfinite(np.asarray(free.longest)) & (np.asarray(z) < np.asarray(free.start))
-    return beyond & (fell | (sizes > NO_INFLUENCE * np.max(sizes, initial=0.0)))
+    matters = (sizes > NO_INFLUENCE * np.max(sizes, initial=0.0)) & ~_hidden(free, z, residual, slopes)
+    return beyond & (fell | matters)
+
+
+def _hidden(free, z, residual, slopes) -> Bool[np.ndarray, " p"]:
+    """Which free numbers a change as large as they are would change the residual by no more than its rounding."""
+    change = np.linalg.norm(slopes, axis=0) * np.maximum(free.magnitudes(z), 1.0)
+    return change <= np.finfo(float).eps * np.linalg.norm(residual)
 
 
 def _near_ends(free, z) -> Int[np.ndarray, " p"]:
@@ -358,9 +367,10 @@ def check_output(shape: Any, what: str) -> None:
 def _checked_end(search, z, args, residual, slopes, tolerance) -> str:
     """How a search ended that says it has converged, by what an undamped step should gain and where it leads."""
     model = LinearModel.at(z, residual, slopes, search.free)
-    step, gain = model.undamped(1.0)
+    step, gain = model.undamped(jnp.maximum(model.magnitudes, 1.0))
     loss = 0.5 * residual @ residual
-    if gain <= max(tolerance, np.finfo(float).eps) * loss or np.max(np.abs(step)) <= THERE:
+    idle = gain <= max(tolerance, np.finfo(float).eps) * loss or loss <= model.rounding()
+    if idle or np.all(np.abs(step) <= THERE * model.magnitudes):
         return "converged"
     if not np.all(np.isfinite(sensitivity(search, z + step, args)[0])):
         return "at an edge"

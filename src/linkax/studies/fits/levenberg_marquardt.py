@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import ArrayLike, Bool, Float
+from jaxtyping import ArrayLike, Bool, Float, Int
 
 from linkax.studies.fits.bounded_least_squares import least_squares_within
 from linkax.studies.parameters.free_parameters import FreeParameters
@@ -17,9 +17,10 @@ from linkax.xla.arrays import Array
 FIRST_DAMPING = 1e-2
 LEAST_DAMPING = 1e-12
 HIGHER, LOWER = 2.0, 5.0
+SLOWLY, FASTEST = 2, 6  # steps that fail before the damping rises ever faster, and the highest power of HIGHER
 ENOUGH = 0.25  # gain of a step, relative to the predicted one, above which the next is damped less
-EXACT = 1e-11  # change of a free number that is rounding
-ROUNDING = 1e-13  # of the residual, relative to that at the start, or to its largest sensitivity
+EXACT = 1e-11  # change of a free number, relative to its magnitude, that is rounding
+ROUNDING = 1e-13  # of the residual, relative to its largest change where free numbers double
 FALLEN = 1e-3  # sensitivity, relative to its largest so far, from which on slopes tell of no long way
 
 
@@ -28,6 +29,7 @@ class LinearModel(NamedTuple):
 
     - `slopes`, `residual`: of fewer rows than the Jacobian and the residual, with the same products.
     - `sizes`: units of the free numbers, as one over each. `low`, `high`: least and largest step.
+    - `magnitudes`: of the free numbers, which a change of them is small or large against.
     """
 
     slopes: Float[Array, "k p"]
@@ -35,6 +37,7 @@ class LinearModel(NamedTuple):
     sizes: Float[Array, " p"]
     low: Float[Array, " p"]
     high: Float[Array, " p"]
+    magnitudes: Float[Array, " p"]
 
     @staticmethod
     def at(
@@ -43,7 +46,8 @@ class LinearModel(NamedTuple):
         """With the norms of the columns of the Jacobian as `sizes`."""
         turn, triangle = jnp.linalg.qr(slopes)
         low, high = map(jnp.asarray, free.room(z))
-        return LinearModel(triangle, turn.T @ residual, jnp.linalg.norm(triangle, axis=0), low, high)
+        sizes, magnitudes = jnp.linalg.norm(triangle, axis=0), free.magnitudes(jnp.asarray(z))
+        return LinearModel(triangle, turn.T @ residual, sizes, low, high, magnitudes)
 
     def step(self, damping: ArrayLike) -> Float[Array, " p"]:
         """−(Jᵀ J + λ D²)⁻¹ Jᵀ r, with λ the damping and D the `sizes`; within the room, the best step there is."""
@@ -67,7 +71,7 @@ class LinearModel(NamedTuple):
 
     def rounding(self) -> Float[Array, ""]:
         """The loss that rounding may leave of data without noise."""
-        return 0.5 * (ROUNDING * jnp.max(self.sizes)) ** 2
+        return 0.5 * (ROUNDING * jnp.max(jnp.linalg.norm(self.slopes, axis=0) * self.magnitudes)) ** 2
 
 
 class _ScaledDescent(optx.AbstractDescent):
@@ -81,12 +85,14 @@ class _ScaledDescent(optx.AbstractDescent):
 
     def init(self, y: Float[Array, " p"], f_info_struct: Any) -> LinearModel:
         none = jnp.zeros(min(len(y), f_info_struct.residual.shape[0]), y.dtype)
-        return LinearModel(jnp.outer(none, jnp.asarray(y)), none, *3 * (jnp.zeros_like(y),))
+        return LinearModel(jnp.outer(none, jnp.asarray(y)), none, *4 * (jnp.zeros_like(y),))
 
     def query(self, y: Float[Array, " p"], f_info: Any, state: LinearModel) -> LinearModel:
         found = LinearModel.at(y, f_info.residual, f_info.jac.as_matrix(), self.free)
-        # Those of logarithms fall with the parameter.
-        largest = jnp.where(jnp.isfinite(self.free.longest), found.sizes, jnp.maximum(state.sizes, found.sizes))
+        # They rise no faster than λ falls: after a leap to where slopes are a million times as large, a damping
+        # that was right for the leap would allow no step. Those of logarithms fall with the parameter.
+        risen = jnp.where(state.sizes > 0.0, jnp.minimum(found.sizes, LOWER**0.5 * state.sizes), found.sizes)
+        largest = jnp.where(jnp.isfinite(self.free.longest), found.sizes, jnp.maximum(state.sizes, risen))
         return found._replace(sizes=largest)
 
     def step(self, step_size: Float[Array, ""], state: LinearModel) -> tuple[Float[Array, " p"], optx.RESULTS]:
@@ -96,18 +102,17 @@ class _ScaledDescent(optx.AbstractDescent):
 class SearchState(NamedTuple):
     """State of `_DelayedDamping`.
 
-    - `damping`: λ. `first`: loss at the start.
-    - `failed`: whether the last step did. `rough`: whether it did so since the function is rough.
+    - `damping`: λ.
+    - `failures`: number of steps that have failed since one did not. `rough`: whether one did since the function is so.
     """
 
     damping: Float[Array, ""]
-    first: Float[Array, ""]
-    failed: Bool[Array, ""]
+    failures: Int[Array, ""]
     rough: Bool[Array, ""]
 
 
 class _DelayedDamping(optx.AbstractSearch):
-    """λ that rises slowly where a step fails, and falls quickly where one succeeds.
+    """λ that rises slowly where a step fails, unless many do, and falls quickly where one succeeds.
 
     Along a narrow valley, where long steps fail, this takes the fewest steps (Transtrum, Sethna, Improvements to the
     Levenberg-Marquardt algorithm for nonlinear least-squares minimization, 2012).
@@ -117,8 +122,7 @@ class _DelayedDamping(optx.AbstractSearch):
     free: FreeParameters
 
     def init(self, y: Float[Array, " p"], f_info_struct: Any) -> SearchState:
-        none = jnp.zeros((), y.dtype)
-        return SearchState(none + FIRST_DAMPING, none, *2 * (jnp.zeros((), bool),))
+        return SearchState(jnp.asarray(FIRST_DAMPING, y.dtype), jnp.array(0), jnp.array(False))
 
     def step(
         self,
@@ -134,13 +138,14 @@ class _DelayedDamping(optx.AbstractSearch):
         gained = before - after
         accept = first_step | (gained > 0.0)
         less = jnp.where(gained > ENOUGH * expected, state.damping / LOWER, state.damping)
-        changed = jnp.where(accept, less, state.damping * HIGHER)
+        changed = jnp.where(accept, less, state.damping * HIGHER ** jnp.clip(state.failures - SLOWLY, 1, FASTEST))
         damping = jnp.maximum(jnp.where(first_step, state.damping, changed), LEAST_DAMPING)
         # A step that fails is the function's roughness where it is but rounding, or where little was expected, and no
         # more was lost, unless it led to where the function is not finite.
         little = self.rtol * before
-        rough = ((jnp.abs(expected) <= little) & ~(gained < -little)) | jnp.all(jnp.abs(y_eval - y) <= EXACT)
-        found = SearchState(damping, jnp.where(first_step, after, state.first), ~accept, ~accept & rough)
+        is_exact = jnp.all(jnp.abs(y_eval - y) <= EXACT * self.free.magnitudes(y))
+        rough = ((jnp.abs(expected) <= little) & ~(gained < -little)) | is_exact
+        found = SearchState(damping, jnp.where(accept, 0, state.failures + 1), ~accept & rough)
         return 1.0 / damping, accept, optx.RESULTS.successful, found
 
 
@@ -178,8 +183,8 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         # A step that has to end early tells nothing of those that follow: where an exponential is small, a rising one
         # gains little.
         cut = jnp.any(step > 0.5 * self.search.free.longest)
-        idle = (gain <= jnp.where(found.failed, self.rtol, self.rtol**2) * loss) & ~cut
-        exact = (loss <= ROUNDING**2 * found.first) | jnp.all(jnp.abs(step) <= jnp.finfo(step.dtype).eps)
+        idle = (gain <= jnp.where(found.failures > 0, self.rtol, self.rtol**2) * loss) & ~cut
+        exact = (loss <= model.rounding()) | jnp.all(jnp.abs(step) <= jnp.finfo(step.dtype).eps * model.magnitudes)
         return idle | exact | found.rough, optx.RESULTS.successful
 
 

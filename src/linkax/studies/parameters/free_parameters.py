@@ -14,7 +14,7 @@ from linkax.studies.parameters.parameters import AbstractParameter
 from linkax.studies.parameters.paths import path_parts
 from linkax.xla.arrays import Array
 
-NEAREST = 1e-9  # to an end of z, from where no step leads closer
+NEAREST = 1e-15  # to an end of z, from where no step leads closer
 CLOSER = 0.99  # of the way to it, that one step may go
 
 
@@ -111,6 +111,10 @@ class FreeParameters(eqx.Module):
     def longest(self) -> Float[Array, " p"]:
         """Largest change of each entry of z in one step."""
         return self._of_entries(lambda leaf: leaf.longest)
+
+    def magnitudes(self, z: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Of each entry of z, which a change of it is small or large against: of a logarithm at least one."""
+        return jnp.maximum(jnp.abs(z), jnp.where(jnp.isfinite(self.longest), 1.0, 0.0))
 
     def room(self, z: Float[Array, " p"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Least and largest change of each entry of z in one step: not to an end, and no longer than the longest."""
