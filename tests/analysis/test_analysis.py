@@ -200,6 +200,21 @@ def test_inverse_dynamics_undoes_the_dynamics():
         lx.inverse_dynamics(mechanism, state, {"bearing": 3.0, ("bearing", None): 3.0})
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_inverse_dynamics_marks_what_the_loops_do_not_allow(unit):
+    """In any unit of acceleration: a drive holds a weight, against which rounding is that of the weight alone."""
+    hold = [lx.Drive("holder", "hinge", speed=0.0)]
+    mechanism, state = pendulum(gravity=9.81 * unit, constraints=hold), lx.State(jnp.zeros(1), jnp.zeros(1))
+    needed = lambda wanted: lx.inverse_dynamics(mechanism, state, {"hinge": wanted}).forces["hinge"][0]
+    # Of the moment of the weight, m g l / 2, the drive bears half.
+    np.testing.assert_allclose(needed(0.0), 9.81 / 4.0 * unit, rtol=1e-12)
+    with pytest.raises(ValueError, match="acceleration asked of joint 'hinge' is missed by"):
+        needed(3.0 * unit)
+    members = jax.jit(jax.vmap(needed))(unit * jnp.array([0.0, 3.0]))
+    np.testing.assert_array_equal(np.isnan(members), [False, True])
+    assert np.isnan(jax.jit(jax.grad(needed))(3.0 * unit))
+
+
 def test_inverse_dynamics_is_in_the_precision_of_the_state():
     mechanism, state = start("crank-slider", "SC3", {"angle": 0.4})
     single = jax.tree.map(lambda array: array.astype(jnp.float32), state)

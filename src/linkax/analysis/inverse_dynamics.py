@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import ArrayLike, Float
 
 from linkax.equations.configuration import configure
@@ -29,10 +30,11 @@ from linkax.tables import Rows, Table, numbers, printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.program import Program
 from linkax.xla.tracing import concrete
+from linkax.xla.undefined import undefined_where
 
 JointKey = str | tuple[str, int]
 Accelerations = Mapping[JointKey, ArrayLike | Sequence[float]]
-MET = 1e-9  # error up to which an acceleration counts as reached, relative to the largest
+MET = 1e-9  # error up to which an acceleration counts as reached, relative to those that add up to it
 MET_ULPS = 1e3  # the same in units of rounding, which is more in single precision
 
 
@@ -73,14 +75,15 @@ def inverse_dynamics(
 
     **Returns:** an `InverseDynamics`.
 
-    **Raises:** `ValueError` where the loops do not allow the accelerations together, naming the joint.
+    **Raises:** `ValueError` where the loops do not allow the accelerations together, naming the joint; under
+    transformations of JAX all numbers are NaN there, and so are their derivatives.
     """
     state, t = checked_state(mechanism, state), jnp.asarray(checked_time(t, "t"))
     wanted = speeds_by_joint(mechanism, accelerations, "acceleration")
     if not wanted.groups:
         raise ValueError("inverse_dynamics needs accelerations; give {joint: acceleration, ...}")
     given = cast((mechanism, state, wanted, t), state.q.dtype)
-    acceleration, forces, misses = _inverse_dynamics(*given)
+    acceleration, forces, misses, most = _inverse_dynamics(*given)
     if concrete(acceleration) is not None:
         if not np.all(np.isfinite(acceleration)):
             system = system_of(mechanism, state.q.dtype)
@@ -89,15 +92,17 @@ def inverse_dynamics(
                 "accelerations are not finite; give mass and inertia to bodies that move without, "
                 f"{', '.join(map(repr, massless)) or 'none here'}, and finite numbers to forces"
             )
-        largest = max(1.0, float(np.max(np.abs(wanted.flat()), initial=0.0)))
-        most = largest * max(MET, MET_ULPS * float(jnp.finfo(acceleration.dtype).eps))
-        for along, miss in misses.by_term():
-            if not np.max(np.abs(miss), initial=0.0) <= most:
+        for (along, miss), (_, bound) in zip(misses.by_term(), most.by_term(), strict=True):
+            if not np.all(np.abs(miss) <= bound):
                 size = np.max(np.abs(miss))
                 raise ValueError(
                     f"the acceleration asked of joint {along.joint!r} is missed by {size:.6g}; the loops do not allow "
                     "it together with the others, so ask for fewer"
                 )
+    else:
+        found, missed = (acceleration, forces), ~jnp.all(jnp.abs(misses.flat()) <= most.flat())
+        masked = jax.tree.map(lambda value: jnp.where(missed, jnp.nan, value), found)
+        acceleration, forces = undefined_where(jax.tree.map(lambda _: missed, found), masked, found)
     of_term = dict(forces.by_term())
     of_joint = {key: of_term[term(key, "acceleration")] for key in accelerations}
     return marked(mechanism, InverseDynamics(of_joint, acceleration))
@@ -115,7 +120,14 @@ def _inverse_dynamics(mechanism, state, wanted, t):
     right = jnp.concatenate([gamma(motion), wanted.flat() - turning])
     tolerance = TangentSpace().prepared(system.dtype).tolerance
     inverse = invert(mass, rows, system.scales, tolerance)
-    acceleration, multipliers = constrained_solve(inverse, mass, rows, generalised_force(motion), right)
+    forces = generalised_force(motion)
+    acceleration, multipliers = constrained_solve(inverse, mass, rows, forces, right)
     multipliers = least_multipliers(rows, multipliers, system.scales, tolerance, inverse.rank).multipliers
-    misses = rows @ acceleration - right
-    return acceleration, wanted.filled(multipliers[len(loops) :]), wanted.filled(misses[len(loops) :])
+    misses = along @ acceleration + turning - wanted.flat()
+    # Rounding is that of the largest terms, which are what each force would do alone, as a weight that a drive holds.
+    size = jnp.diagonal(mass)
+    alone = (jnp.abs(forces) + jnp.abs(rows).T @ jnp.abs(multipliers)) / jnp.where(size > 0.0, size, jnp.inf)
+    fastest = jnp.max((jnp.abs(acceleration) + alone) / system.scales)
+    terms = jnp.abs(along) @ system.scales * fastest + jnp.abs(turning) + jnp.abs(wanted.flat())
+    most = lax.stop_gradient(terms) * max(MET, MET_ULPS * float(jnp.finfo(system.dtype).eps))
+    return acceleration, *map(wanted.filled, (multipliers[len(loops) :], misses, most))
