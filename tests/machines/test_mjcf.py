@@ -250,6 +250,47 @@ def test_what_newer_versions_of_mujoco_have_is_not_dropped_in_silence(tmp_path, 
         driven(tmp_path / "driven.xml", **given)
 
 
+CARRIED = """<mujoco>{option}<worldbody><body name="arm"><joint name="pin" axis="0 1 0" {pin}/><geom size="0.1" {rest}/>
+    <body name="load" gravcomp="{part}"><joint name="hook" axis="0 1 0" {hook}/>
+      <geom size="0.1" pos="1 0 0" {rest}/></body></body></worldbody><actuator>{motor}</actuator></mujoco>"""
+CARRIES = {"option": "", "pin": 'actuatorgravcomp="true"', "hook": "", "part": "1", "motor": '<motor joint="hook"/>'}
+CARRIES["rest"] = 'contype="0" conaffinity="0"'
+DISABLED = '<option><flag actuation="disable"/></option>'
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, None),
+        ({"pin": 'actuatorfrcrange="-1 1"'}, None),
+        ({"hook": 'actuatorfrcrange="-1 1"'}, None),
+        ({"pin": CARRIES["pin"] + ' actuatorfrcrange="-1 1"', "part": "0"}, None),
+        (
+            {"pin": CARRIES["pin"] + ' actuatorfrcrange="-1 1"'},
+            "joint 'pin': the range of its force limits",
+        ),
+        ({"motor": ""}, "joint 'pin': MuJoCo leaves out, without an actuator, what carries"),
+        ({"option": DISABLED}, "joint 'pin': MuJoCo leaves out, without an actuator, what carries"),
+    ],
+)
+def test_weight_that_actuators_carry_is_carried_or_it_is_told(tmp_path, given, message):
+    """MuJoCo's range of a joint limits what carries a weight along it, and without actuators nothing does."""
+    path, text = tmp_path / "carried.xml", CARRIED.format(**CARRIES | given)
+    path.write_text(text)
+    if message is not None:
+        with pytest.raises(lx.MachineFileError, match=message):
+            lx.load(path)
+        return
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    machine = lx.load(path)
+    solution = lx.Solution.of_state(machine.mechanism(), lx.assemble(machine.mechanism(), {"pin": 0.0, "hook": 0.0}))
+    found = [solution.joint_acceleration(name)[0] for name in ("pin", "hook")]
+    np.testing.assert_allclose(found, data.qacc, rtol=1e-9, atol=1e-9)
+    assert machine.left_out == ()
+
+
 STRAIGHT = """<mujoco><worldbody><site name="wall" pos="0 0 2"/><site name="floor"/>
   <body name="arm" pos="1 0 0"><joint axis="0 1 0"/><geom size="0.1" contype="0" conaffinity="0"/>
     <site name="tip" pos="0 0 2"/></body></worldbody>

@@ -32,8 +32,10 @@ def read_body(compiled: Compiled, index: int) -> None:
     frames = {sites[site].name: np.array(model.site_pos[site]) for site in of_body}
     mass = float(model.body_mass[index])
     draft.body(name, drawn, mass, at, inertia, where, frames)
-    if model.body_gravcomp[index]:
-        draft.carry(name, at, -mass * float(model.body_gravcomp[index]) * compiled.gravity, where)
+    carried = -mass * float(model.body_gravcomp[index]) * compiled.gravity
+    if np.any(carried):
+        draft.carry(name, at, carried, where)
+        _check_carrying(compiled, index)
     if model.body_mocapid[index] >= 0:
         draft.leave_out(where, "mocap", "the body is moved by motion capture; it stays as drawn")
     begin = int(model.body_geomadr[index])
@@ -48,3 +50,17 @@ def read_body(compiled: Compiled, index: int) -> None:
         draft.joint_at(Fixed, fixed, stations[0], stations[-1], where)
     for step in range(count):
         read_joint(compiled, first + step, stations[step], stations[step + 1])
+
+
+def _check_carrying(compiled: Compiled, index: int) -> None:
+    """Tell where actuators of joints are to carry a body, and cannot as the force that carries it here."""
+    model, name = compiled.model, compiled.body_names[index]
+    actuated = model.nu and compiled.has("ACTUATION")
+    while index:
+        first = int(model.body_jntadr[index])
+        for joint in range(first, first + int(model.body_jntnum[index])):
+            if model.jnt_actgravcomp[joint] and (model.jnt_actfrclimited[joint] or not actuated):
+                reason = "the range of its force limits" if actuated else "MuJoCo leaves out, without an actuator,"
+                where = compiled.where("joint", joint)
+                compiled.draft.leave_out(where, "actuator", f"{reason} what carries body {name!r} along it")
+        index = int(model.body_parentid[index])
