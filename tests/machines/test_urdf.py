@@ -183,6 +183,35 @@ def test_stops_and_dampers(tmp_path):
     assert "crank_bearing.limit" not in without.params["forces"]
 
 
+ACTS = {
+    "damping": '<dynamics damping="3"/>',
+    "friction": '<dynamics friction="2"/>',
+    "limit": '<limit lower="-1" upper="1"/>',
+    "mimic": '<mimic joint="crank_bearing"/>',
+}
+ELSEWHERE = """<link name="a">{inertial}</link><joint name="other" type="{kind}"><parent link="frame"/><child link="a"/>
+  {acts}</joint>"""
+
+
+@pytest.mark.parametrize("word", ACTS)
+@pytest.mark.parametrize("kind", ["cylindrical", "planar", "floating", "spherical", "loop", "constraint"])
+def test_what_acts_along_joints_is_not_dropped_in_silence(tmp_path, word, kind):
+    """Of several coordinates, whose numbers would have several units, and where a loop is closed."""
+    plain = CLOSED.get(kind, ELSEWHERE.format(inertial=INERTIAL, kind=kind, acts=""))
+    end = f"</{kind}>" if kind in CLOSED else "</joint>"
+    with pytest.raises(lx.MachineFileError, match=rf'ignore=\["{word}"\]'):
+        load(tmp_path, plain.replace(end, ACTS[word] + end))
+    idle = '<dynamics damping="0" friction="0"/><limit lower="0" upper="0" effort="1" velocity="1"/>'
+    assert all(item.kind == "unread" for item in load(tmp_path, plain.replace(end, idle + end)).left_out)
+
+
+def test_a_fixed_joint_stays_whatever_acts_along_it(tmp_path):
+    fixed = lambda acts: ELSEWHERE.format(inertial=INERTIAL, kind="fixed", acts=acts)
+    load(tmp_path, fixed(ACTS["damping"] + ACTS["limit"]))
+    with pytest.raises(lx.MachineFileError, match="mimic: 'crank_bearing' is to lead a joint of type 'fixed'"):
+        load(tmp_path, fixed(ACTS["mimic"]))
+
+
 def test_words_to_ignore_are_checked(tmp_path):
     with pytest.raises(
         ValueError, match=r"ignore has 'limits' \(did you mean 'limit'\?\), which nothing in the file is"

@@ -174,6 +174,7 @@ class _Robot:
         )
         draft.joint_at(KINDS[kind], node.name, *ends, where, **arguments)
         if KINDS[kind] not in (Revolute, Prismatic):
+            self._leave_out_along(node, f"a joint of type {kind!r}, without one coordinate")
             return
         if (dynamics := node.find("dynamics")) is not None:
             damping, friction = (float(dynamics.numbers(name, 1, [0.0])[0]) for name in ("damping", "friction"))
@@ -183,6 +184,20 @@ class _Robot:
             draft.limit(node.name, node.name, limit.where, lower, upper)
         if (mimic := node.find("mimic")) is not None:
             self._mimic(node, mimic)
+
+    def _leave_out_along(self, node: Node, what: str) -> None:
+        """Note what acts along a joint that it cannot act along here; nothing but <mimic> would move a fixed one."""
+        kind, dynamics, limit, mimic = node.attribute("type"), *map(node.find, ("dynamics", "limit", "mimic"))
+        if dynamics is not None and KINDS[kind] is not Fixed:
+            for name in ("damping", "friction"):
+                if np.any(dynamics.numbers(name, 1, [0.0])):
+                    self.draft.leave_out(dynamics.where, name, f"{name} of {what}")
+        if limit is not None and KINDS[kind] is not Fixed and kind != "continuous":
+            lower, upper = (float(limit.numbers(end, 1, [0.0])[0]) for end in ("lower", "upper"))
+            if lower < upper:
+                self.draft.leave_out(limit.where, "limit", f"the range of {what}")
+        if mimic is not None:
+            self.draft.leave_out(mimic.where, "mimic", f"{mimic.attribute('joint')!r} is to lead {what}")
 
     def _mimic(self, node: Node, mimic: Node) -> None:
         """Its coordinate = multiplier × that of the leader + offset."""
@@ -217,6 +232,7 @@ class _Robot:
             return
         arguments = _axes(node, KINDS[kind], axes)
         self.draft.joint_at(KINDS[kind], node.name, first, second, node.where, cut=True, **arguments)
+        self._leave_out_along(node, f"a <{node.tag}>; give it to a joint of the tree")
 
     def _coupling(self, node: Node) -> None:
         """θ of the successor = ratio × θ of the predecessor, both from the nearest link that carries the two."""
