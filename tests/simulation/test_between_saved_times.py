@@ -118,6 +118,8 @@ def test_bad_times_are_named(top):
         solution.at([0.1, np.nan])
     with pytest.raises(ValueError, match=r"times \[s\] have shape \(1, 1\); give \(n,\) times"):
         solution.at([[0.5]])
+    with pytest.raises(ValueError, match=r"times \[s\] have shape \(0,\), .* give at least one"):
+        solution.at([])
     np.testing.assert_array_equal(solution.at(0.5).q, solution.at([0.5]).q)
     alone = lx.Solution.of_state(solution.mechanism, solution.end)
     with pytest.raises(ValueError, match="has one time, and no motion between"):

@@ -30,6 +30,8 @@ def motion_at(solution: Solution, ts: Number | Vector | list[Number]) -> Solutio
     if times.shape[:-1] not in ((), shape[:-1]):
         batch = f", or {(*shape[:-1], 'n')} of a batch" if shape[:-1] else ""
         raise ValueError(f"{what} have shape {times.shape}; give (n,) times{batch}")
+    if not times.size:
+        raise ValueError(f"{what} have shape {times.shape}, and a solution at no time says nothing; give at least one")
     if shape[-1] < 2:
         raise ValueError("this solution has one time, and no motion between times; simulate, and save several times")
     saved, asked = concrete(solution.ts), concrete(times)

@@ -383,7 +383,7 @@ class Solution(Kinematics):
         of the saved ones is infinite, as one that was not reached.
 
         **Raises:** `ValueError` for a time outside of the saved ones, for one between saved times so far apart that no
-        state on the loops is near (infinite in a batch), and for a solution of one state.
+        state on the loops is near (infinite in a batch), for no time, and for a solution of one state.
         """
         return motion_at(self, ts)
 
