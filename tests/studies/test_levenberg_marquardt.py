@@ -75,16 +75,16 @@ def test_starts_of_other_magnitudes_are_right_or_it_is_told(unit, size, rate):
 
 @pytest.mark.parametrize("kind", [float, lx.Positive, partial(lx.Bounded, lower=0.0, upper=1e15)])
 @pytest.mark.parametrize("power", [1, 2, 3, 4])
-@pytest.mark.filterwarnings("ignore:the data do not determine", "ignore:the best value lies on a bound")
+@pytest.mark.filterwarnings("ignore:the data do not", "ignore:the best value", "ignore:the fit ended .no better step")
 def test_starts_far_from_a_power_are_right_or_it_is_told(power, kind):
-    """Slopes where it starts are by up to 1e45 smaller or larger than at the minimum; from 1e-12 to 1e9 it is found."""
+    """Slopes at the start are up to 1e45 times those at the minimum; from 1e-12 to 1e20 it is found."""
     data = 2.0 * X + NOISE
     least = 0.5 * (data @ data - (X @ data) ** 2 / (X @ X))
     for start in (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9, 1e12, 1e15):
         found = lx.fit(lambda p: p["a"] ** power * X - data, {"a": kind(start)})
         told = found.ended != "converged" or found.undetermined or found.on_bound
         assert told or found.loss <= least * (1.0 + 1e-4), start
-        assert not told or (power > 1 and not 1e-12 < start**power < 1e10), start
+        assert not told or (power > 1 and not 1e-12 < start**power < 1e20), start
 
 
 @pytest.mark.parametrize("rate", [1.5, 1.5 * (1.0 + 1e-9), 3.0])

@@ -96,7 +96,10 @@ class _ScaledDescent(optx.AbstractDescent):
         return found._replace(sizes=largest)
 
     def step(self, step_size: Float[Array, ""], state: LinearModel) -> tuple[Float[Array, " p"], optx.RESULTS]:
-        return state.step(1.0 / step_size), optx.RESULTS.successful
+        # The least damping is that of the slopes here, or a start far away would damp for ever.
+        damping = 1.0 / step_size
+        sizes = jnp.where(damping < HIGHER * LEAST_DAMPING, jnp.linalg.norm(state.slopes, axis=0), state.sizes)
+        return state._replace(sizes=sizes).step(damping), optx.RESULTS.successful
 
 
 class SearchState(NamedTuple):
