@@ -30,7 +30,7 @@ from linkax.tables import Rows, Table, numbers, printed_as
 from linkax.xla.arrays import Array
 from linkax.xla.program import Program
 from linkax.xla.tracing import concrete
-from linkax.xla.undefined import undefined_where
+from linkax.xla.undefined import nan_where
 
 JointKey = str | tuple[str, int]
 Accelerations = Mapping[JointKey, ArrayLike | Sequence[float]]
@@ -100,9 +100,8 @@ def inverse_dynamics(
                     "it together with the others, so ask for fewer"
                 )
     else:
-        found, missed = (acceleration, forces), ~jnp.all(jnp.abs(misses.flat()) <= most.flat())
-        masked = jax.tree.map(lambda value: jnp.where(missed, jnp.nan, value), found)
-        acceleration, forces = undefined_where(jax.tree.map(lambda _: missed, found), masked, found)
+        missed = jnp.logical_not(jnp.all(jnp.abs(misses.flat()) <= most.flat()))
+        acceleration, forces = nan_where(missed, (acceleration, forces), given)
     of_term = dict(forces.by_term())
     of_joint = {key: of_term[term(key, "acceleration")] for key in accelerations}
     return marked(mechanism, InverseDynamics(of_joint, acceleration))
