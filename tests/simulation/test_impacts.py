@@ -1,5 +1,7 @@
 """Impacts on rigid stops: closed forms, loops, energies and derivatives, and where bounces accumulate."""
 
+import functools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -203,6 +205,50 @@ def test_spheres_swap_speeds():
     np.testing.assert_allclose(run.end.v, [0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(run.end.q, [0.7, 1.3], atol=1e-9)
     assert run.impacts("hit")[-1] == 1
+
+
+def on_a_table(numbers):
+    """A ball that bounces on a table that a drive moves up and down, from random numbers."""
+    least, ranges = jnp.array([0.5, 0.75, 0.01, 1.0]), jnp.array([1.0, 0.25, 0.04, 7.0])
+    start, restitution, amplitude, frequency = least + ranges * numbers
+    bodies = one, table = lx.point_mass("ball", 1.0), lx.point_mass("table", 2.0)
+    rails = [lx.Prismatic(f"{body.name}_rail", lx.GROUND, body, axis="y") for body in bodies]
+    upwards = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    shapes = lx.Sphere(one, 0.1), lx.Plane(table.at([0.0, 0.0, 0.0], rotation=upwards))
+    impact = lx.Impact(*shapes, restitution=restitution, name="hit")
+    drive = lx.Drive("motor", "table_rail", lambda t: amplitude * jnp.sin(frequency * t))
+    mechanism = lx.Mechanism(bodies, rails, [GRAVITY, impact], [drive])
+    return mechanism, lx.State(jnp.stack([0.0, start]), jnp.stack([amplitude * frequency, 0.0])), 1.5
+
+
+def in_a_loop(numbers):
+    """A four-bar whose rocker swings into a stop, from random numbers."""
+    restitution, stop, speed = numbers[:3] * jnp.array([0.4, 0.3, 0.6]) + jnp.array([0.6, 1.9, 0.7])
+    stop = lx.Impact("rocker_bearing", upper=stop, restitution=restitution, name="hit")
+    linkage = four_bar(crank=0.3, coupler=0.7, rocker=0.6, ground=0.8, cut="rocker_pin", forces=[stop])
+    return linkage, lx.State(START.q, speed * START.v), 1.0
+
+
+@pytest.mark.parametrize("made", [on_a_table, pytest.param(in_a_loop, marks=pytest.mark.slow)])
+def test_hits_are_the_same_at_any_tolerance(made):
+    """Of random mechanisms with drives and loops, which steps leave by the tolerance between their ends."""
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(0, None))
+    def ends(numbers, rtol):
+        mechanism, start, t1 = made(numbers)
+        saveat = diffrax.SaveAt(t1=True)
+        run = lx.simulate(mechanism, start, t1=t1, accuracy=lx.Accuracy(rtol=rtol), saveat=saveat, max_steps=1000)
+        return run.result == lx.RESULTS.successful, run.impacts("hit")[-1], run.end.q, run.stats["num_steps"]
+
+    numbers = np.random.default_rng(1).uniform(size=(100, 4))
+    (*_, counts, exact, _), *others = (ends(numbers, rtol) for rtol in (1e-12, 1e-8, 1e-4))
+    assert np.sum(counts) > 150
+    for (well, impacts, q, steps), rtol in zip(others, (1e-8, 1e-4), strict=True):
+        assert np.all(well)
+        np.testing.assert_array_equal(impacts, counts)
+        np.testing.assert_allclose(q, exact, atol=1e3 * rtol)
+        assert np.max(steps) < 200
 
 
 BODY, FLOOR = lx.point_mass("a", 1.0), lx.Plane(lx.GROUND)

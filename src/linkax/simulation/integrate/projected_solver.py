@@ -193,16 +193,19 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         moved = self.after_step and args.method.moves_after_steps
         made_jump = True if switching or moved or args.times is not None else made_jump
         solver = self._stepping(args, t0, y0, t1 - t0)
-        stepped = args if args.times is None else dataclasses.replace(args, until=t1)
-        y1, error, dense_info, inner, result = solver.step(terms, t0, t1, y0, stepped, solver_state.inner, made_jump)
+        within_step = args if args.times is None else dataclasses.replace(args, until=t1)
+        stepped, error, dense_info, inner, result = solver.step(
+            terms, t0, t1, y0, within_step, solver_state.inner, made_jump
+        )
         stages = stage_distances(dense_info, t1 - t0, self.solver)
         leaves = solver_state.arrives
         # By an infinite error a solver tells that its step has failed: of infinity no derivative is a number.
         failed = error is not None and jnp.logical_not(jnp.all(jnp.isfinite(error)))
         error = None if error is None else lax.stop_gradient(jnp.where(failed, 0.0, error))
         if self.after_step:
-            y1, errors, arrives = args.corrected(t1, y1, error)
+            y1, errors, arrives = args.corrected(t1, stepped, error)
         else:
+            y1 = stepped
             arrives = leaves if stages is None else stages[-1]
             errors = None if error is None else args.errors(y1, error)
         errors = jax.tree.map(lambda error: jnp.where(failed, jnp.inf, error), errors)
@@ -229,8 +232,10 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             at_most = jnp.maximum(CLOSED, jnp.sqrt(jnp.finfo(end.dtype).eps))
             opens = lax.stop_gradient(jnp.max(jnp.stack([*between, OPENS / at_most * end])))
         if switching:
+            # Corrected as its end is: a root between a motion and its end is none that a shorter step would come to.
+            closed = lambda share: within(t0 + share * (t1 - t0)) + share * (y1 - stepped)
             fixed = without_derivatives((args, t0, t1, y0, y1))
-            switch, sides = lax.stop_gradient(meet(*fixed, within=within))
+            switch, sides = lax.stop_gradient(meet(*fixed, within=closed))
             _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
         state = SolverState(inner, arrives, closest, locked)
         of_step = StepError(errors, leaves, placement, opens, switch, locked.astype(t1.dtype))

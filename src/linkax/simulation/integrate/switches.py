@@ -110,7 +110,7 @@ def meet(
 ) -> tuple[Float[Array, ""], Float[Array, " kept"]]:
     """Find where a step goes past a switch, and on which sides it ends.
 
-    **Arguments:** `within(t)`: interpolates in the step.
+    **Arguments:** `within(share)`: the motion at a share of the step, from y0 to y1 without a jump.
 
     **Returns:** the share of the step up to the first switch, one for none; the sides after a step that goes past none,
     with impacts counted, and not yet happened.
@@ -123,7 +123,7 @@ def meet(
     at_end = problem.switches(t1, y1)
     # In units of what rounding makes of each, so that the unit of a switch does not matter.
     ulps = sides / positive_or_one(eps * _sensitivity(problem, t0, t1, y0, y1, at_end))
-    inside = lambda share: ulps * problem.switches(t0 + share * duration, within(t0 + share * duration))
+    inside = lambda share: ulps * problem.switches(t0 + share * duration, within(share))
     at_end = ulps * at_end
     search = _searched(inside, at_end, 2.0 * TIME_ULPS * eps)
 
