@@ -251,6 +251,21 @@ def test_hits_are_the_same_at_any_tolerance(made):
         assert np.max(steps) < 200
 
 
+@pytest.mark.parametrize(
+    "law", [lambda t: 2.0 * t, lambda t: jnp.sin(1.8 * t), lambda t: 4.0 * t**2], ids=["steady", "slower", "faster"]
+)
+def test_a_drive_into_a_stop_is_named(law):
+    """No impulse changes the speed of a joint that is driven; no hit is counted."""
+    stop, motor = lx.Impact("hinge", upper=0.5, restitution=0.5, name="stop"), lx.Drive("motor", "hinge", law)
+    arm = pendulum(forces=[stop], constraints=[motor])
+    with pytest.raises(lx.SimulationError, match="drive 'motor' of joint 'hinge' leads into Impact 'stop'") as told:
+        lx.simulate(arm, lx.assemble(arm), t1=1.0)
+    found = told.value.solution
+    assert found.result == lx.RESULTS.driven_into_stop
+    np.testing.assert_allclose(law(found.t_end), 0.5, rtol=1e-12)
+    assert found.impacts("stop")[np.isfinite(found.ts)][-1] == 0
+
+
 BODY, FLOOR = lx.point_mass("a", 1.0), lx.Plane(lx.GROUND)
 
 

@@ -22,6 +22,7 @@ from linkax.formulations.constraint_split import ConstraintSplit
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.linalg.saddle_inverse import invert
 from linkax.model.mechanism import Mechanism
+from linkax.simulation.integrate.impacts import impacts_of
 from linkax.simulation.integrate.results import RESULTS, Solution
 from linkax.simulation.start.initial_state import MOVES, moving_joints
 from linkax.xla.arrays import Array, Scalar
@@ -55,6 +56,8 @@ def cause(solution: Solution) -> str:
     if (result == RESULTS.no_branch) | (result == RESULTS.not_unique):
         basis = ConstraintSplit.at(system, t, state.q, method.tolerance).inverse.basis
         return f" The branches cross in the motion of joints {_listed(moving_joints(system, t, state.q, basis))}."
+    if result == RESULTS.driven_into_stop:
+        return _driven_into(solution, system, t)
     return (
         _no_acceleration(solution, system, method, t)
         or _exhausted(solution, system, t)
@@ -162,11 +165,25 @@ def _jumps(solution, system, t):
     )
 
 
+def _named_drives(mechanism):
+    """The drives of a mechanism, each with its joints."""
+    drives = [constraint for constraint in mechanism.constraints if constraint.is_driven]
+    each = [f"{drive.display_name}{''.join(f' of joint {joint!r}' for joint in drive.joints)}" for drive in drives]
+    return f"The {' and the '.join(each)}" if drives else ""
+
+
+def _driven_into(solution, system, t):
+    """Name the stop that drives lead into where the run ends, and the drives."""
+    q = solution.end.q
+    gaps_of = [abs(float(impact.gap(configure(system, t, q)))) for impact in impacts_of(system)]
+    stop = impacts_of(solution.mechanism)[int(np.argmin(gaps_of))].display_name
+    return f" {_named_drives(solution.mechanism)} leads into {stop} at t = {float(t):.6g} s."
+
+
 def _drives(solution, system, t):
     """Name drives that ask for what the loops do not allow just after the end of the run."""
-    drives = [constraint for constraint in solution.mechanism.constraints if constraint.is_driven]
-    asked = [f"{drive.display_name}{''.join(f' of joint {joint!r}' for joint in drive.joints)}" for drive in drives]
-    told = f" The {' and the '.join(asked)} asks for what the loops do not allow after t = {float(t):.6g} s."
+    drives = _named_drives(solution.mechanism)
+    told = f" {drives} asks for what the loops do not allow after t = {float(t):.6g} s."
     if solution.result == RESULTS.locked:
         return told
     method, end = solution.run.tangent_space.prepared(system.dtype, solution.rank_nearby), solution.end

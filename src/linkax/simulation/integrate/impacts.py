@@ -1,7 +1,8 @@
 """Impacts: the jump of speeds at a rigid stop, and what a run keeps of them.
 
 Behind the sides of switches the vector y has, for each `linkax.Impact`, how many impacts it had, and what energy they
-took. Its side is 1, and −1 where the motion has come to rest on its stop.
+took. Its side is 1 while motion goes on, `RESTS` where it has come to rest on the stop, and `DRIVEN_IN` where a drive
+leads into the stop.
 """
 
 from typing import Any
@@ -23,6 +24,8 @@ from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 
 Problem = Any  # that of `linkax.simulation.integrate.problem`, which imports `switches`
+
+RESTS, DRIVEN_IN = -1.0, -2.0
 
 
 def impacts_of(mechanism: Mechanism | System) -> list[Impact]:
@@ -46,15 +49,21 @@ def _record_begins(mechanism):
     return sum(force.has_switch for force in mechanism.forces)
 
 
-def at_rest(system: System, kept: Float[Array, " kept"]) -> Bool[Array, ""]:
-    """Whether the motion of a system with impacts rests on a stop, by what y keeps of switches."""
+def has_ended(system: System, kept: Float[Array, " kept"]) -> Bool[Array, ""]:
+    """Whether no motion of a system with impacts leads on from a stop, by what y keeps of switches."""
     return jnp.any(kept[places(system)] < 0.0)
 
 
-def struck(problem: Problem, t: Float[Array, ""], y: Float[Array, " n"], index: Int[Array, ""]) -> Float[Array, " n"]:
-    """Put the impact of an index into y: speeds after it, its energy, and whether the motion comes to rest there.
+def is_driven_in(system: System, kept: Float[Array, " kept"]) -> Bool[Array, ""]:
+    """Whether a drive leads into a stop, likewise."""
+    return jnp.any(kept[places(system)] == DRIVEN_IN)
 
-    v⁺ = v⁻ + M⁻¹ (∇gᵀ Λ + Jᵀ λ) with J (v⁺ − v⁻) = 0, from the constrained solve with the force ∇gᵀ.
+
+def struck(problem: Problem, t: Float[Array, ""], y: Float[Array, " n"], index: Int[Array, ""]) -> Float[Array, " n"]:
+    """Put the impact of an index into y: speeds after it, its energy, and whether motion leads on.
+
+    v⁺ = v⁻ + M⁻¹ (∇gᵀ Λ + Jᵀ λ) with J (v⁺ − v⁻) = 0, from the constrained solve with the force ∇gᵀ. Where loops and
+    drives leave the gap no speed of its own, that solve finds nothing but rounding.
     """
     system, impacts, (q, v) = problem.system, impacts_of(problem.system), problem.unpacked(y)
     of = lambda numbers: jnp.stack([jnp.asarray(number, q.dtype) for number in numbers])[index]
@@ -69,15 +78,19 @@ def struck(problem: Problem, t: Float[Array, ""], y: Float[Array, " n"], index: 
     linear = linear_system(system, t, q)
     split, none = method.split(lax.stop_gradient(linear)), jnp.zeros(linear.jacobian.shape[0], q.dtype)
     response, _ = method.solve_accelerations(linear, split, row, none, refinements=1)
+    largest = jnp.linalg.norm(row * system.scales) * jnp.linalg.norm(response / system.scales)
+    gives_way = row @ method.tangential_part(linear, split, response) > jnp.sqrt(jnp.finfo(q.dtype).eps) * largest
+    hits = (before < 0.0) & lax.stop_gradient(gives_way)
     factor = 1.0 + of([impact.restitution for impact in impacts])
-    change = response * ratio(factor * jnp.maximum(-before, 0.0), row @ response, 0.0)
+    change = response * ratio(jnp.where(hits, -factor * before, 0.0), row @ response, 0.0)
     taken = -(v + change / 2.0) @ (linear.mass @ change)
     first, count = _record_begins(system), len(impacts)
-    recorded = jnp.asarray(y).at[first + index].add(1.0).at[first + count + index].add(taken)
+    recorded = jnp.asarray(y).at[first + index].add(hits).at[first + count + index].add(taken)
     after = problem.with_speeds(recorded, v + change)
     # Where the gap opens slowly, and forces close it again, infinitely many impacts would follow.
     still = lax.stop_gradient(after)
     opens, pushed = jax.jvp(closing, problem.unpacked(still), problem.unpacked(problem.derivative(t, still)))
-    rests = (opens < of([impact.slowest for impact in impacts])) & (pushed < 0.0)
+    slowest = of([impact.slowest for impact in impacts])
+    rests = jnp.where((opens < slowest) & (pushed < 0.0), RESTS, 1.0)
     place = jnp.asarray(places(system))[index]
-    return after.at[place].set(jnp.where(rests, -1.0, 1.0))
+    return after.at[place].set(jnp.where(opens < -slowest, DRIVEN_IN, rests))

@@ -19,7 +19,7 @@ from linkax.model.known_times import known_times
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.discrete_adjoint import Integrated, Integrator, integrate, solve_by_diffrax
-from linkax.simulation.integrate.impacts import at_rest, impacts_of
+from linkax.simulation.integrate.impacts import has_ended, impacts_of, is_driven_in
 from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.options import saved_times
 from linkax.simulation.integrate.problem import Problem
@@ -116,8 +116,10 @@ def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     saved = saveat.subs.ts if run.has_discrete_adjoint else None
     solve = integrate if run.has_discrete_adjoint else solve_by_diffrax
     integrated, _ = solve(InitialValueProblem(problem, y0, t0, t1, saved), integrator, False)
-    rests = impacts_of(problem.system) and at_rest(problem.system, jnp.asarray(problem.sides(integrated.y_end)))
-    result = _result(integrated.result, initial, in_order, control.is_adaptive, rests)
+    result = integrated.result
+    if impacts_of(problem.system):
+        result = _at_stop(result, problem.system, jnp.asarray(problem.sides(integrated.y_end)))
+    result = _result(result, initial, in_order, control.is_adaptive)
     integrated = integrated._replace(result=result)
     return _without_derivatives(integrated, event, inputs)
 
@@ -168,10 +170,14 @@ def _wrapped_event(event):
     return eqx.tree_at(lambda e: e.cond_fn, event, jax.tree.map(_OnManifold, event.cond_fn, is_leaf=callable))
 
 
-def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptive: bool, rests: Any):
+def _at_stop(result, system, kept):
+    """How a run ended, by what y keeps of switches, where no motion led on from a stop."""
+    ended = RESULTS.where(is_driven_in(system, kept), RESULTS.driven_into_stop, RESULTS.rests_on_stop)
+    return RESULTS.where(has_ended(system, kept) & (result == RESULTS.dt_min_reached), ended, result)
+
+
+def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptive: bool):
     """The first of what is wrong at the start, else how the integration ended."""
-    if isinstance(rests, jax.Array):
-        result = RESULTS.where(rests & (result == RESULTS.dt_min_reached), RESULTS.rests_on_stop, result)
     if not is_adaptive:
         result = RESULTS.where(result == RESULTS.dt_min_reached, RESULTS.diverged, result)
     result = RESULTS.where(initial.unique, result, RESULTS.not_unique)

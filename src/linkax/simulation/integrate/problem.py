@@ -21,7 +21,7 @@ from linkax.model.forces.internal_states import scales
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack
-from linkax.simulation.integrate.impacts import at_rest, impacts_of
+from linkax.simulation.integrate.impacts import has_ended, impacts_of
 from linkax.simulation.integrate.switches import Sides, held, values
 from linkax.simulation.start.state import State
 from linkax.straight_line.transform import straight_line
@@ -104,7 +104,7 @@ class Problem(eqx.Module):
         """Whether a step may be taken from a vector."""
         if not impacts_of(self.system):
             return self.can_start
-        return self.can_start & jnp.logical_not(at_rest(self.system, jnp.asarray(self.sides(y))))
+        return self.can_start & jnp.logical_not(has_ended(self.system, jnp.asarray(self.sides(y))))
 
     def switches(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " m"]:
         """Values of the switches at a vector, (m,)."""

@@ -67,6 +67,10 @@ with warnings.catch_warnings():
             "faster, or begins beyond it. Take a `linkax.JointLimit` or a `linkax.Contact`, which holds it, or end "
             "the run before."
         )
+        driven_into_stop = (
+            "A drive leads into the stop of a `linkax.Impact`: the loops and the drive leave no impulse that would "
+            "change how fast the gap closes. Move the stop, let the drive turn back before it, or end the run before."
+        )
         not_reached = "The branch does not lead to all values: it turns back before, or ends where another one crosses."
 
 
@@ -86,6 +90,7 @@ KNOWN_RESULTS = (
     "off_loops",
     "locked",
     "rests_on_stop",
+    "driven_into_stop",
     "not_reached",
 )
 
