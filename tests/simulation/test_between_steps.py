@@ -46,6 +46,30 @@ def test_no_thin_obstacle_is_passed_through(stop):
     assert np.max(speeds[:, 0]) < 9.9
 
 
+@pytest.mark.parametrize("stop", STOPS.values(), ids=STOPS)
+def test_no_blade_turns_past_a_post(stop):
+    """A blade that turns freely must hit a post within its first turn, and a step without error takes many.
+
+    From a rigid post it stays within one turn; a soft contact lets the fastest through, and takes from their speed.
+    """
+
+    def end(numbers):
+        speed, angle = 7.0 + 20.0 * numbers[0], 0.5 + 5.0 * numbers[1]
+        place = jnp.stack([0.8 * jnp.cos(angle), 0.8 * jnp.sin(angle), 0.0 * angle])
+        post = lx.Sphere(lx.GROUND.at(place), 10.0 ** (-3.0 + 1.5 * numbers[2]))
+        arm = lx.rod("arm", 1.0, 3.0)
+        blade = lx.Capsule(arm.at("base"), arm.at("tip"), radius=0.002)
+        hinge = lx.Revolute("hinge", lx.GROUND, arm.at("base"), axis="z")
+        mechanism = lx.Mechanism([arm], [hinge], [stop(blade, post)])
+        start = lx.State(jnp.zeros(1), speed[None])
+        run = lx.simulate(mechanism, start, t1=1.0, saveat=diffrax.SaveAt(t1=True))
+        return run.end.q[0], run.end.v[0] - speed
+
+    turned, change = jax.jit(jax.vmap(end))(np.random.default_rng(0).uniform(size=(THROWS // 2, 3)))
+    assert np.min(np.abs(change)) > 1e-3
+    assert stop is STOPS["contact"] or np.max(turned) < 2.0 * np.pi
+
+
 class Holder:
     """An object of one's own that holds a law."""
 

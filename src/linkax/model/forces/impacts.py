@@ -39,9 +39,12 @@ class Impact(AbstractForce):
     Where bounces follow each other ever faster, or a body comes to lie on the stop, infinitely many impacts would
     happen in finite time. The run ends there, once dg/dt after an impact is below `slowest` and the forces lead back to
     the stop, with the result `RESULTS.rests_on_stop`, as a run does that begins beyond the stop. Where motion is to go
-    on, take `linkax.JointLimit` or `linkax.Contact`. Where a drive leads into the stop, and with it closed loops leave
-    no impulse that would change dg/dt, the run ends with `RESULTS.driven_into_stop`. Within a step the least value of the gap is sought, so that thin
-    obstacles are hit, as long as the gap between two eighths of a step falls no faster than beside them.
+    on, take `linkax.JointLimit` or `linkax.Contact`. Where a drive leads into the stop, and closed loops leave no
+    impulse that would change dg/dt, the run ends with `RESULTS.driven_into_stop`.
+
+    Within a step the least value of the gap is sought, so that thin obstacles are hit. Between two eighths of a step
+    the gap is taken to fall no faster than beside them; where the joints between the two bodies turn by more than six
+    radians in a step, it is tried again, shorter.
 
     **Arguments:**
 

@@ -40,6 +40,8 @@ class StepError(NamedTuple):
       [rad, lengths of the mechanism], at its end as many times that as less is allowed there; None without loops.
     - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
       past, one for none; None where there are none.
+    - `turns`: how fast joints turn between bodies whose force elements switch, at the faster of its ends [rad/s]; None
+      without such elements.
     - `locks`: one where it leads up to where the mechanism locks, else zero: diffrax makes numbers of all of these.
     """
 
@@ -48,6 +50,7 @@ class StepError(NamedTuple):
     placement: Placement
     opens: Float[Array, ""] | None = None
     switch: Float[Array, ""] | None = None
+    turns: Float[Array, ""] | None = None
     locks: Float[Array, ""] | float = 0.0
 
 

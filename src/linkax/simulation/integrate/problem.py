@@ -22,7 +22,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack
 from linkax.simulation.integrate.impacts import has_ended, impacts_of
-from linkax.simulation.integrate.switches import Sides, held, values
+from linkax.simulation.integrate.switches import Sides, held, turning, values
 from linkax.simulation.start.state import State
 from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
@@ -109,6 +109,10 @@ class Problem(eqx.Module):
     def switches(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " m"]:
         """Values of the switches at a vector, (m,)."""
         return values(bound(self.system, self.internal(y)), t, *self.unpacked(y))
+
+    def turning(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, ""] | None:
+        """How fast joints between bodies whose force elements switch turn at a vector [rad/s]; None without such."""
+        return turning(self.system, t, *self.unpacked(y))
 
     def errors(self, y: Float[Array, " n"], error: Float[Array, " n"]) -> Errors:
         """Error estimates of q and v at a vector y, as changes (n_v,) of both, and of internal states, if any."""

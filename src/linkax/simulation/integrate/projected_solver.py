@@ -223,7 +223,7 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
                 locked = (ahead > 0.0) & (problem.drives_on(t, after, BEYOND * ahead) > AT_LEAST * ahead)
         closest = jnp.minimum(solver_state.closest, jnp.minimum(placement.passes, arrives))
         within = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
-        opens = switch = None
+        opens = switch = turns = None
         if self.after_step and args.method.checks_loops(args.system.topology):
             on_the_way = t0 + jnp.asarray(ON_THE_WAY, t1.dtype) * (t1 - t0)
             times = jnp.append(on_the_way, t1)
@@ -236,9 +236,11 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             closed = lambda share: within(t0 + share * (t1 - t0)) + share * (y1 - stepped)
             fixed = without_derivatives((args, t0, t1, y0, y1))
             switch, sides = lax.stop_gradient(meet(*fixed, within=closed))
+            begins, ends = (fixed[0].turning(*end) for end in ((t0, y0), (t1, y1)))
+            turns = None if begins is None else lax.stop_gradient(jnp.maximum(begins, ends))
             _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
         state = SolverState(inner, arrives, closest, locked)
-        of_step = StepError(errors, leaves, placement, opens, switch, locked.astype(t1.dtype))
+        of_step = StepError(errors, leaves, placement, opens, switch, turns, locked.astype(t1.dtype))
         return y1, of_step, dense_info, state, result
 
     def corrected(

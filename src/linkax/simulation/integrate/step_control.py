@@ -24,6 +24,9 @@ FIRST_TURN = 1e-2  # radians, or lengths of the mechanism
 FIRST_TURN_SINGULAR = 1e-3  # from a singular configuration, where the first stage does not know all of the loops
 SMALLEST_STEP_ULPS = 4.0
 MOST_RETRIES = 4
+# Radians that joints may turn in a step between bodies whose force elements switch, and beyond which it is tried again:
+# what comes back with each turn would be passed over between two samples of a step that has no error to shorten it.
+TURN, TURN_AT_MOST = 4.0, 6.0
 
 
 class ControlState(NamedTuple):
@@ -144,10 +147,16 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             end = jnp.where(late, jnp.where(keep, to_switch, jnp.minimum(to_switch, next_t1)), end)
             again = again | late
             free = jnp.where(late, jnp.maximum(free, t1 - t0), free)
+        longest = jnp.inf
+        if y_error.turns is not None:
+            # Where a step is rejected for its error, the speeds at its end say nothing.
+            longest = jnp.where(keep, ratio(TURN, y_error.turns, jnp.inf), jnp.inf)
+            far = t1 - t0 > TURN_AT_MOST / TURN * longest
+            end, again = jnp.minimum(jnp.where(again, end, jnp.inf), t0 + longest), again | far
         free = jnp.where(keep, free, 0.0)
         # Controllers around the innermost one have times of their own to end steps at.
         longer = jnp.maximum(next_t1, next_t0 + free) if self.controller is self.innermost else next_t1
-        next_t1 = jnp.where(again, end, longer)
+        next_t1 = jnp.where(again, end, jnp.minimum(longer, next_t0 + longest))
         ends = keep & jnp.logical_not(again)
         result = diffrax.RESULTS.where(ends & (y_error.locks > 0.0), diffrax.RESULTS.dt_min_reached, result)
         next_t0 = jnp.where(ends, next_t0, t0)

@@ -24,14 +24,16 @@ from linkax.equations.system import System
 from linkax.model.elements import Time
 from linkax.model.forces.force import AbstractForce, Load
 from linkax.simulation.integrate import impacts
+from linkax.spatial.vectors import length
 from linkax.xla.arrays import Array
-from linkax.xla.derivatives import positive_or_one
+from linkax.xla.derivatives import positive_or_one, ratio
 
 SAMPLES = 8  # of a step, and of a window of it
 WINDOWS = 64  # of a step that are looked at
 ON_ULPS = 256.0  # what counts as there, in units of what rounding of the state changes
 START_ULPS = 1e5  # how far beyond a stop a run may begin, as rounding of its assembly
 TIME_ULPS = 8.0
+JUMPS = 1.25  # times the changes beside it: what no convex value has, nor one that is a little concave beside a kink
 SHORTEN = 1e-3  # a step that begins past a switch
 ITERATIONS = 60
 PROBE = 1e-5  # relative change of numbers, by which it is seen what switches change with
@@ -78,6 +80,23 @@ def start_sides(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v:
     least[stops] = -START_ULPS * float(jnp.finfo(q.dtype).eps)
     sides = jnp.where(found > least, 1.0, -1.0).astype(q.dtype)
     return jnp.concatenate([sides, jnp.zeros(2 * len(stops), q.dtype)]) if len(stops) else sides
+
+
+def turning(
+    system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
+) -> Float[Array, ""] | None:
+    """How fast the joints between the bodies of a force element turn, all of them together, of the element where it is
+    most [rad/s]; None where no element with a switch attaches to bodies.
+    """
+    path, between = system.topology.path, []
+    for force in system.forces:
+        if force.has_switch and (frames := force.itself.frames):
+            ways = path[[system.topology.body_index(frame.body) for frame in frames]]
+            between.append(np.max(ways, axis=0) - np.min(ways, axis=0))
+    if not between:
+        return None
+    turns = length(move(configure(system, t, q), v).edge_turn)
+    return jnp.max(np.stack(between).astype(turns.dtype) @ turns)
 
 
 class _Search(NamedTuple):
@@ -200,12 +219,11 @@ def _searched(inside, at_end, narrowest) -> _Search:
         nearest = jnp.min(values, axis=1)
         past = nearest[1:] < -ON_ULPS
         finds, place = jnp.any(past), jnp.argmax(past)
-        slack = _slack(values)
+        slack, lowest = _between(values)
         pending = jnp.where(first, slack < 0.0, search.pending)
         # Of the switch looked at, the interval where it may go farthest past; where there is none, a pending one.
-        own = slack[:, search.switch]
-        deeper = ~first & jnp.any(own < 0.0) & ((b - a) > narrowest)
-        chosen = jnp.argmin(own)
+        deeper = ~first & jnp.any(slack[:, search.switch] < 0.0) & ((b - a) > narrowest)
+        chosen = jnp.argmin(lowest[:, search.switch])
         waiting = jnp.argmax(pending.reshape(-1))
         interval, switch = waiting // num, waiting % num
         ends = (
@@ -238,12 +256,19 @@ def _searched(inside, at_end, narrowest) -> _Search:
     return lax.while_loop(lambda search: search.goes_on & (search.count < WINDOWS), look, begin)
 
 
-def _slack(values):
-    """How far values stay from zero between each two samples, at least, (SAMPLES, m); negative where they may pass."""
-    changes = jnp.abs(jnp.diff(values, axis=0))
-    beside = jnp.pad(changes, ((1, 1), (0, 0)))
-    steepest = jnp.maximum(changes, jnp.maximum(beside[:-2], beside[2:]))
-    return jnp.minimum(values[:-1], values[1:]) - steepest
+def _between(values):
+    """How far values stay from zero between each two samples, at least, negative where they may pass, (SAMPLES, m); and
+    how low they are there where they are convex in time, with kinks, or jump up, (SAMPLES, m).
+    """
+    one, other, changes = values[:-1], values[1:], jnp.abs(jnp.diff(values, axis=0))
+    steepest = lambda ends: jnp.max(changes[ends], axis=0, keepdims=True)
+    beside = jnp.concatenate([steepest(slice(2)), changes, steepest(slice(-2, None))])
+    before, after, nearest = beside[:-2], beside[2:], jnp.minimum(one, other)
+    most = jnp.maximum(before, after)
+    # Lines that go on as steep as they are beside meet below what is convex; in it no change is larger than both are.
+    meeting = ratio(after * one + before * other - before * after, before + after, nearest)
+    lowest = jnp.where(changes > JUMPS * most, nearest - jnp.where(one < other, before, after), meeting)
+    return nearest - jnp.maximum(changes, most), lowest
 
 
 def crossed(
