@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Bool, Float
 
 from linkax.equations.configuration import configure
-from linkax.equations.constraint_rows import constraint_rate, constraint_residual
+from linkax.equations.constraint_rows import constraint_rate, constraint_residual, is_driven
 from linkax.equations.coordinates import on_manifold, rates, speeds
 from linkax.equations.internal_states import bound, internal_rates, num_states
 from linkax.equations.loops import widest
@@ -53,8 +53,12 @@ class Problem(eqx.Module):
     until: Float[Array, ""] | None = None
 
     def stage_time(self, t: Float[Array, ""], until: Float[Array, ""] | None) -> Float[Array, ""]:
-        """The time of a stage, just before the end of its step: steps end where laws may jump."""
-        if self.times is None or until is None:
+        """The time of a stage, just before the end of its step: steps end where laws may jump.
+
+        Not with drives: where one turns back next to where the mechanism locks, the loops that its last stage opens are
+        all that tells of a step too long.
+        """
+        if self.times is None or until is None or is_driven(self.system):
             return t
         end = lax.stop_gradient(until)
         return jnp.minimum(t, until + (jnp.nextafter(end, -jnp.inf) - end))
