@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from mechanisms import pendulum
+from scipy.spatial.transform import Rotation
 
 import linkax as lx
+from linkax.analysis.eigenpairs import eigh, spectrum, symmetric_spectrum
 from linkax.analysis.linearisation import StateSlopes
 
 AREAS, DEAD, MODULUS, MASS = (2e-3, 1.2e-3), 1e-4, 1.4e9, 500.0
@@ -83,6 +85,60 @@ def test_derivatives_of_equal_frequencies_are_marked():
 
     slopes = jax.jit(jax.jacfwd(frequencies))(jnp.array([4.0, 4.0, 9.0]))
     np.testing.assert_allclose(slopes, [3 * [np.nan], 3 * [np.nan], [0.0, 0.0, 1.0 / 6.0]], atol=1e-12)
+
+
+def test_zeros_are_zero_and_what_is_slow_is_not():
+    """Nothing holds one place, and 1e-5 rad/s is beside 1e8: zeros are exact, and move no other eigenvalue."""
+    turn = Rotation.from_euler("xyz", [0.3, -0.4, 0.5]).as_matrix()
+    values = lambda stiffness: lx.Linearisation(*np.zeros((2, 3)), np.eye(3), stiffness, np.zeros((3, 3))).eigenvalues
+    for squares, axes, most in (([0.0, 1e-10, 1e16], np.eye(3), 1e-13), ([0.0, 1e-4, 3.0], turn, 1e-10)):
+        found = values(axes @ np.diag(squares) @ axes.T)
+        assert np.sum(found == 0.0) == 2
+        rates = np.sort(found.imag)[[-1, -2]]
+        np.testing.assert_allclose(rates, np.sqrt(squares[:0:-1]), rtol=most)
+        np.testing.assert_allclose(found.real, 0.0, atol=most * rates[0])
+
+
+def test_eigenvectors_beside_zeros():
+    """A v = λ v for all of them, also where one to three zeros follow from each other; one by itself is rounding."""
+    random = np.random.default_rng(0)
+    for chain in range(1, 4):
+        jordan = np.zeros((6, 6))
+        jordan[:chain, :chain] = np.eye(chain, k=1)
+        jordan[chain:, chain:] = random.normal(size=(6 - chain, 6 - chain))
+        other = random.normal(size=(6, 6))
+        matrix = jnp.asarray(other @ jordan @ np.linalg.inv(other))
+        found, vectors = map(np.asarray, spectrum(matrix))
+        assert np.sum(found == 0.0) == (chain if chain > 1 else 0)
+        np.testing.assert_allclose(matrix @ vectors, vectors * found, atol=1e-10)
+        np.testing.assert_allclose(np.linalg.norm(vectors, axis=0), 1.0, rtol=1e-12)
+        exact = np.append(np.linalg.eigvals(jordan[chain:, chain:]), np.zeros(chain))
+        for value in exact:
+            np.testing.assert_allclose(np.min(np.abs(found - value)), 0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.diag([1.0, 1.0, 2.0])])
+def test_equal_frequencies_spoil_nothing_that_a_loss_leaves_out(matrix):
+    """The trace of a symmetric matrix has a derivative by it, as has another matrix' times zero."""
+    left_out = lambda matrix: symmetric_spectrum(matrix)[0][:2]
+    np.testing.assert_array_equal(jax.jacrev(lambda matrix: jnp.sum(0.0 * left_out(matrix)))(matrix), np.zeros((3, 3)))
+    np.testing.assert_array_equal(jax.jacrev(lambda matrix: jnp.sum(eigh(matrix)[0]))(matrix), np.eye(3))
+    assert np.all(np.isfinite(jax.jacfwd(lambda matrix: eigh(matrix))(matrix)[1]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_derivative_of_a_decay_beside_two_carts_that_nothing_holds(derivative):
+    """Their stiffness is zero twice, exactly; the damped one's λ = −c / m."""
+
+    def decay(damping):
+        carts = [lx.point_mass(name, 2.0) for name in "ab"]
+        joints = [lx.Prismatic(f"along {cart.name}", lx.GROUND, cart, "x") for cart in carts]
+        mechanism = lx.Mechanism(carts, joints, [lx.JointDamper("along a", damping)])
+        values = lx.linearise(mechanism, lx.State(np.zeros(2), np.zeros(2)), degrees_of_freedom=2).eigenvalues.real
+        return values[jnp.argmin(values)]
+
+    np.testing.assert_allclose(derivative(jax.jit(decay))(0.5), -0.5, rtol=1e-12)
 
 
 WEIGHT = 3.0 * 9.81 * 0.5  # of a pendulum of 3 kg and 1 m, as a torque

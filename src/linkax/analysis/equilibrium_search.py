@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float, Int
 
-from linkax.analysis.steady import Nearby, eigh, largest_force
+from linkax.analysis.eigenpairs import eigh
+from linkax.analysis.steady import Nearby, largest_force
 from linkax.equations.constraint_rows import is_driven
 from linkax.equations.coordinates import retract
 from linkax.equations.dynamics import generalised_force

@@ -5,71 +5,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Complex, Float
 
+from linkax.analysis.eigenpairs import spectrum
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
-from linkax.xla.batches import one_by_one
-from linkax.xla.undefined import undefined_where
 
 GROWS = 1e-6  # |Re λ| / |λ| up to which a motion neither grows nor decays
-
-EQUAL_ULPS = 100.0  # distance between eigenvalues, in what rounding moves them by, up to which they are equal
-
-_eig = one_by_one(lambda matrix: tuple(lax.linalg.eig(matrix, compute_left_eigenvectors=True)))
-
-
-def _spectrum(matrix):
-    """Eigenvalues and eigenvectors of a matrix, differentiable to any order; derivatives of equal ones are NaN."""
-    values, vectors, left = _eigenpairs(matrix)
-    if not len(matrix):
-        return values, vectors
-    equal = _equal_another(*map(lax.stop_gradient, (matrix, values, vectors, left)))
-    return undefined_where((equal, equal), (values, vectors), matrix)
-
-
-def _equal_another(matrix, values, vectors, left):
-    """Whether each eigenvalue is as close to another as rounding of the largest moves it, by ε |λ| / |wᵀ v|."""
-    along = jnp.abs(jnp.sum(left * vectors, axis=0))  # of unit vectors
-    apart = jnp.abs(values[:, None] - values[None, :]) + jnp.diag(jnp.full(len(values), jnp.inf, matrix.dtype))
-    rounding = EQUAL_ULPS * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(values))
-    # No quotient: of a double zero both sides are zero.
-    return jnp.min(apart, axis=1) * along <= rounding
-
-
-@jax.custom_jvp
-def _eigenpairs(matrix):
-    """Eigenvalues λ, and right and left eigenvectors A v = λ v, wᵀ A = λ wᵀ, as columns."""
-    values, left, vectors = _eig(matrix)
-    return values, vectors, left.conj()
-
-
-@_eigenpairs.defjvp
-def _eigenpairs_jvp(primals, tangents):
-    """Of each eigenvalue λ by itself: (A − λ) v̇ − λ̇ v = −Ȧ v and wᵀ v̇ = 0.
-
-    That has one solution whatever the others are, such as a double zero, whose eigenvectors are parallel.
-    """
-    (matrix,), (change,) = primals, tangents
-    values, vectors, left = _eigenpairs(matrix)
-    equal = _equal_another(matrix, values, vectors, left)
-    unit = jnp.eye(len(values) + 1, dtype=values.dtype)
-
-    def slopes(matrix, change, vectors, left):
-        def of_one(each):
-            value, vector, left, equal = each
-            shifted = matrix - value * unit[1:, 1:]
-            bordered = jnp.block([[shifted, -vector[:, None]], [left[None], jnp.zeros((1, 1), values.dtype)]])
-            right = jnp.pad(change.astype(values.dtype) @ vector, (0, 1))
-            return -jnp.linalg.solve(jnp.where(equal, unit, bordered), right)
-
-        found = lax.map(of_one, (values, vectors.T, left.T, equal))
-        return found[:, -1], found[:, :-1].T
-
-    to_values, to_vectors = slopes(matrix, change, vectors, left)
-    _, to_left = slopes(matrix.T, change.T, left, vectors)
-    return (values, vectors, left), (to_values, to_vectors, to_left)
 
 
 def _table(found: "Linearisation") -> Table:
@@ -169,11 +111,11 @@ def state_matrix(
 @jax.jit
 def _of_members(stiffness, damping, states):
     """Eigenvalues and eigenvectors of the state matrix of each member of a batch."""
-    return jnp.vectorize(_spectrum, signature="(n,n)->(n),(n,n)")(state_matrix(stiffness, damping, states))
+    return jnp.vectorize(spectrum, signature="(n,n)->(n),(n,n)")(state_matrix(stiffness, damping, states))
 
 
 def gyroscopic_frequencies(matrix: Float[Array, "n n"]) -> Float[Array, " n//2"]:
     """Natural frequencies, as in `Linearisation`, of a state matrix whose eigenvalues are pairs of opposite sign."""
-    values, _ = _spectrum(matrix)
+    values, _ = spectrum(matrix)
     size = jnp.sqrt(values.real**2 + values.imag**2)
     return jnp.sort(jnp.where(jnp.abs(values.real) <= GROWS * size, jnp.abs(values.imag), -jnp.abs(values.real)))[::2]

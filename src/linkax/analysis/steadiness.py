@@ -8,9 +8,10 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Bool, Float
 
+from linkax.analysis.eigenpairs import eigh
 from linkax.analysis.linearisation import StateSlopes
 from linkax.analysis.moving import Coefficients, Moving
-from linkax.analysis.steady import AGREES, eigh, largest_force, limit, missed_rates, of_missed_rate
+from linkax.analysis.steady import AGREES, largest_force, limit, missed_rates, of_missed_rate
 from linkax.equations.configuration import configure
 from linkax.equations.motion import move
 from linkax.equations.system import system_of

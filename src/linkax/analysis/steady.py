@@ -23,7 +23,6 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array
-from linkax.xla.batches import one_by_one
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import concrete
 
@@ -33,8 +32,6 @@ LATER = np.pi * (5.0**0.5 - 1.0) * np.arange(1, 22)
 AGREES = 1e-6  # relative error of speeds and forces up to which they count as equal
 # Of limits in units of rounding: in single precision a disc that rolls in a circle seems to change by up to 4e-3.
 LEAST_ULPS = 1e5
-
-eigh = one_by_one(jnp.linalg.eigh)
 
 
 def may_move(state: State) -> bool:

@@ -200,7 +200,8 @@ def find_turns(
     each = jnp.concatenate([of_all[:1, :, 0], of_all[:, :, 1]]).transpose(0, 2, 1).reshape(-1, count + 1)
     matrix = each[:, 1:] - each[:, :1]
     inverse = _pseudo_inverse(matrix)
-    turns, of_slides = -pace * inverse @ each[:, 0], 3 * len(_turning_slides(topology))
+    turns = -pace * inverse @ each[:, 0]
+    of_slides = 3 * len(_turning_slides(topology))
     if not of_slides:
         return turns
     open_ = jnp.eye(count, dtype=turns.dtype) - inverse @ matrix  # a projection: what is not one of its numbers is none

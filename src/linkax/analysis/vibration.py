@@ -8,10 +8,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import ArrayLike, Int
 
-from linkax.analysis.linearisation import EQUAL_ULPS, Linearisation, StateSlopes, gyroscopic_frequencies, state_matrix
+from linkax.analysis.eigenpairs import symmetric_spectrum
+from linkax.analysis.linearisation import Linearisation, StateSlopes, gyroscopic_frequencies, state_matrix
 from linkax.analysis.moving import Moving
 from linkax.analysis.steadiness import ROUNDING_ULPS, UNFELT, Steadiness
-from linkax.analysis.steady import eigh, may_move, system_in
+from linkax.analysis.steady import may_move, system_in
 from linkax.analysis.symmetry import find_turns, num_turns
 from linkax.equations.internal_states import bound
 from linkax.equations.system import system_of
@@ -22,11 +23,10 @@ from linkax.model.numbers import whole_number
 from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
-from linkax.spatial.vectors import largest
 from linkax.xla.arrays import Array
 from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, concrete
-from linkax.xla.undefined import nan_where, undefined_where
+from linkax.xla.undefined import nan_where
 
 
 def linearise(
@@ -176,11 +176,7 @@ def _frequencies(moving, symmetric, damping):
         couples = jnp.max(jnp.abs(gyroscopic)) > UNFELT * system.fastest(moving.v) + rounding
     # The eigenproblem that is not used gets eigenvalues apart from each other, so that its derivatives are finite.
     apart = jnp.diag(jnp.arange(1.0, len(symmetric) + 1.0, dtype=system.dtype) ** 2)
-    values, vectors = eigh(jnp.where(couples, apart, symmetric))
-    steps = jnp.diff(lax.stop_gradient(values), prepend=-jnp.inf, append=jnp.inf)
-    near = steps <= EQUAL_ULPS * jnp.finfo(system.dtype).eps * largest(lax.stop_gradient(values))
-    equal = near[1:] | near[:-1]
-    values, vectors = undefined_where((equal, equal), (values, vectors), symmetric)
+    values, vectors = symmetric_spectrum(jnp.where(couples, apart, symmetric))
     frequencies = jnp.sign(values) * jnp.sqrt(jnp.where(values == 0.0, 1.0, jnp.abs(values)))
     if may_couple:
         matrix = state_matrix(jnp.where(couples, symmetric, apart), jnp.where(couples, gyroscopic, 0.0))
