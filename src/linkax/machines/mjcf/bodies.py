@@ -15,12 +15,15 @@ HIDDEN_GROUP = 3  # geoms of this group and later ones, MuJoCo's viewer hides, s
 
 def read_body(compiled: Compiled, index: int) -> None:
     """Read a body with its joints, and massless ones between them where it has several."""
-    model, draft = compiled.model, compiled.draft
+    model = compiled.model
+    draft = compiled.draft
     where = compiled.where("body", index)
-    name, parent = compiled.body_names[index], compiled.body_names[model.body_parentid[index]]
+    name = compiled.body_names[index]
+    parent = compiled.body_names[model.body_parentid[index]]
     own = pose(model.body_pos[index], from_quaternion(model.body_quat[index]))
     drawn = draft.poses[parent] @ own
-    first, count = int(model.body_jntadr[index]), int(model.body_jntnum[index])
+    first = int(model.body_jntadr[index])
+    count = int(model.body_jntnum[index])
     chain = [free_name(f"{name}[{step}]", compiled.body_names) for step in range(1, count)]
     for between in chain:
         draft.body(between, drawn, 0.0, np.zeros(3), np.zeros((3, 3)), where)
@@ -54,7 +57,8 @@ def read_body(compiled: Compiled, index: int) -> None:
 
 def _check_carrying(compiled: Compiled, index: int) -> None:
     """Tell where actuators of joints are to carry a body, and cannot as the force that carries it here."""
-    model, name = compiled.model, compiled.body_names[index]
+    model = compiled.model
+    name = compiled.body_names[index]
     actuated = model.nu and compiled.has("ACTUATION")
     while index:
         first = int(model.body_jntadr[index])

@@ -128,7 +128,8 @@ def fit(
     is_loss = _is_loss(function, free, data)
     search = _search_by(optimiser, function, free, mode, is_loss, tolerance)
     steps = DEFAULT_STEPS["loss" if is_loss else "residual"] if steps is None else steps
-    begin, others = free.start, None
+    begin = free.start
+    others = None
     if places is not None:
         begin, others = _best_start(search, places, data, steps, progress, checkpoint)
     z, losses, ended = run_search(search, data, steps, tolerance, patience, checkpoint, progress, begin)
@@ -167,7 +168,8 @@ def _settled(again, search, laboratory, z, data, steps, losses, ended):
     **Warns:** where it does not.
     """
     for count in range(ROUNDS + 1):
-        errors, (before,) = laboratory.errors(search.free.params(z), FITTED), data
+        errors = laboratory.errors(search.free.params(z), FITTED)
+        (before,) = data
         slopes = np.asarray(sensitivity(search, z, data)[1])
         if not np.all(np.isfinite(slopes)):
             break
@@ -237,13 +239,19 @@ def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> F
     residual, slopes = (np.asarray(part) for part in sensitivity(search, z, args))
     if ended == "converged":
         ended = _checked_end(search, z, args, residual, slopes, tolerance)
-    gradient, pulled = slopes.T @ residual, _beyond_bounds(search.free, z, residual, slopes)
-    loss, count, scatter = float(0.5 * residual @ residual), len(residual) - search.free.num_priors, None
-    there, factors = np.ones(len(residual), bool), np.ones(len(residual))
+    gradient = slopes.T @ residual
+    pulled = _beyond_bounds(search.free, z, residual, slopes)
+    loss = float(0.5 * residual @ residual)
+    count = len(residual) - search.free.num_priors
+    scatter = None
+    there = np.ones(len(residual), bool)
+    factors = np.ones(len(residual))
     if laboratory is not None:
         errors = laboratory.errors(search.free.params(z), FITTED)
         worth = laboratory.worth(errors, args[0], slopes)
-        there[:count], factors[:count], scatter = errors.there, worth.factors, worth.scatter
+        there[:count] = errors.there
+        factors[:count] = worth.factors
+        scatter = worth.scatter
     count = int(np.sum(there[:count]))
     seen = pulled | ~_hidden(search.free, z, residual, slopes)
     residual, slopes = residual[there], (factors[:, None] * np.where(seen, slopes, 0.0))[there]
@@ -269,7 +277,8 @@ def _fit_of_residual(search, z, args, losses, ended, tolerance, laboratory) -> F
 
 def _beyond_bounds(free, z, residual, slopes) -> Bool[np.ndarray, " p"]:
     """Which free numbers are on a bound: by the slope of the loss and its curvature, its minimum lies beyond."""
-    gradient, sizes = slopes.T @ residual, np.linalg.norm(slopes, axis=0)
+    gradient = slopes.T @ residual
+    sizes = np.linalg.norm(slopes, axis=0)
     lower, upper = map(np.asarray, free.ends)
     way = np.where(gradient > 0.0, np.minimum(z - lower, free.longest), upper - z)
     # Where no step leads closer to a bound, a number that is pulled there is on it.
@@ -294,7 +303,8 @@ def _near_ends(free, z) -> Int[np.ndarray, " p"]:
 
 def _still(search, z, begin, args, losses, on_bound) -> list[str]:
     """The names of those that no step has moved, since the loss has no slope there, although it is no minimum."""
-    still, names = np.asarray(z == begin), search.free.free_names
+    still = np.asarray(z == begin)
+    names = search.free.free_names
     inside = [entry for entry in np.flatnonzero(still) if names[entry] not in on_bound]
     # Of all, there was no step, or each was too long.
     if not inside or (np.all(still) and (len(losses) == 1 or len(set(losses)) > 1)):
@@ -348,7 +358,8 @@ def check_output(shape: Any, what: str) -> None:
     for path, leaf in jax.tree.leaves_with_path(shape):
         name = jax.tree_util.keystr(path) or "its value"
         try:
-            size, kinds[name] = np.prod(jnp.shape(leaf)), jnp.result_type(leaf)
+            size = np.prod(jnp.shape(leaf))
+            kinds[name] = jnp.result_type(leaf)
         except TypeError as error:
             raise ValueError(f"{what} returned {leaf!r} in {name}; give real numbers") from error
         if size == 0:
