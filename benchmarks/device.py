@@ -43,6 +43,12 @@ def _growing(rate_of: Callable[[int], float]) -> Iterator[dict]:
         yield {"members": size, "per_second": round(rate, 1)}
 
 
+def _room() -> dict:
+    """Memory for a chunk: two thirds of what JAX may use of the device, where that tells it."""
+    told = jax.devices()[0].memory_stats()
+    return {"memory": told["bytes_limit"] * 2 / 3} if told else {}
+
+
 def by_linkax() -> Iterator[dict]:
     """Ends of motions, and these with their derivatives."""
     rtol, error = cheapest_tolerance()
@@ -50,7 +56,7 @@ def by_linkax() -> Iterator[dict]:
     slide = lambda numbers: end(numbers).end.q[-1]
     for what, function in (("run", slide), ("run and gradient", jax.value_and_grad(slide))):
         jax.clear_caches()
-        swept = lambda size, function=function: lx.sweep(function, masses(size), progress=False)
+        swept = lambda size, function=function: lx.sweep(function, masses(size), chunk=size, **_room(), progress=False)
         for row in _growing(lambda size, swept=swept: 1.0 / swept(size).seconds_per_member):
             yield {"what": what, "setting": f"rtol {rtol:g}", "error": error, **row}
 

@@ -26,7 +26,9 @@ from linkax.xla.enumerations import code, is_item, item
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import Progress, compiling
 
-DEFAULT_CHUNK = 256  # members on one device; larger chunks take no less time for each member
+DEFAULT_CHUNK = 256  # members on a CPU; larger chunks take no less time for each member
+# Members on a graphics card: an H200 takes 0.7 s for 1000 crank-sliders, 1.4 for 10 000, 9.6 for 100 000.
+CHUNK_OF_GRAPHICS_CARD = 16_384
 DEFAULT_MEMORY = 2**31  # bytes
 
 
@@ -53,8 +55,8 @@ def sweep(
 
     - `function`: params -> arrays in any pytree, `Solution` included. A pure function that JAX can trace.
     - `params`: pytree of arrays with one leading axis of members.
-    - `chunk`: number of members that one device computes together; by default 256, or fewer where they need more than
-      `memory`.
+    - `chunk`: number of members that one device computes together; by default 256 on a CPU and by an executor, 16 384
+      on other devices, or fewer where they need more than `memory`.
     - `memory`: of each device, for one chunk [bytes].
     - `devices`: by default all devices of this process. A CPU is one device, and computes one chunk on each of its
       cores. In a job of several processes (`jax.distributed`) each computes its share, and all return the whole.
@@ -101,7 +103,8 @@ def sweep(
         if folder is not None:
             SweepStore.check("output", outputs)
         order = _order(difficulty, params, count, options)
-        chunk = chunk or min(DEFAULT_CHUNK, count)
+        on_cpu = executor is not None or devices[0].platform == "cpu"
+        chunk = chunk or min(DEFAULT_CHUNK if on_cpu else CHUNK_OF_GRAPHICS_CARD, count)
         with compiling():
             if work is None:
                 program = SweepProgram.compiled(function, one, chunk, memory, devices)
