@@ -104,29 +104,30 @@ MAPS_OF_A_FILE = 15_000
 def _forget_programs():
     gc.unfreeze()
     memory_maps.clear_caches()
+    gc.freeze()
     if sys.platform == "linux":
         ctypes.CDLL(None).malloc_trim(0)  # the C library keeps what is freed
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup():
-    """Forget programs where this process holds more memory than the machine has left: the smallest takes 1.4 MB."""
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Keep the memory of this process in order between tests, none of which is charged for it.
+
+    Programs are forgotten before a test where this process holds more memory than the machine has left: the smallest
+    takes 1.4 MB. And after a file where the next one may run out of memory maps, in the middle of which linkax would do
+    so with a warning.
+    """
     if psutil.Process().memory_info().rss > psutil.virtual_memory().available:
         _forget_programs()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _room_for_compiled_programs():
-    """Forget programs before a file of tests that there may be no memory maps for.
-
-    Where these run out in the middle of a file, linkax forgets programs with a warning.
-    """
-    if not memory_maps.has_room(MAPS_OF_A_FILE):
-        _forget_programs()
-    yield
-    # What a file leaves is mostly programs in caches. To look through those of all files for garbage takes 7 s a time.
-    gc.collect(1)
-    gc.freeze()
+    result = yield
+    if nextitem is None or nextitem.path != item.path:
+        if memory_maps.has_room(MAPS_OF_A_FILE):
+            # What a file leaves is mostly programs in caches. To look through those of all files for garbage takes 7 s.
+            gc.collect(1)
+            gc.freeze()
+        else:
+            _forget_programs()
+    return result
 
 
 @pytest.fixture(autouse=True)
