@@ -203,6 +203,39 @@ def test_derivatives_through_contacts():
     np.testing.assert_allclose(jax.jit(jax.jacrev(end))(X), found, atol=1e-9 * size)
 
 
+def towards_a_post(numbers):
+    """A ball that flies at a post, and the share of its energy of what the law takes up over both radii."""
+    stiffness, one, other, share = 10.0 ** (
+        jnp.array([3.0, -3.0, -3.0, -1.0]) + jnp.array([5.0, 2.0, 2.0, 2.0]) * numbers
+    )
+    ball, law = lx.point_mass("ball", 2.0), lx.ContactLaw(stiffness)
+    post = lx.Sphere(lx.GROUND.at([1.0, 0.0, 0.0]), other)
+    contact = lx.Contact(lx.Sphere(ball, one), post, law, name="post")
+    mechanism = lx.Mechanism([ball], [lx.Prismatic("rail", lx.GROUND, ball, axis="x")], [contact])
+    speed = jnp.sqrt(share * law.energy(one + other))
+    return mechanism, lx.State(jnp.zeros(1), speed[None]), share
+
+
+def test_what_is_pressed_through_ends_the_run():
+    """Where its energy is that at nine tenths of both radii, and nowhere below; else a ball bounces back."""
+
+    def end(numbers):
+        mechanism, start, share = towards_a_post(numbers)
+        run = lx.simulate(mechanism, start, t1=2.0 / start.v[0], saveat=diffrax.SaveAt(t1=True))
+        return share, run.result == lx.RESULTS.pressed_through, run.end.v[0] / start.v[0]
+
+    numbers = np.random.default_rng(0).uniform(size=(100, 4))
+    share, through, left = map(np.asarray, jax.jit(jax.vmap(end))(numbers))
+    np.testing.assert_array_equal(through, share > 0.9**2.5)
+    np.testing.assert_allclose(left[~through], -1.0, atol=1e-5)
+
+
+def test_what_is_pressed_through_is_named():
+    mechanism, start, _ = towards_a_post(np.array([0.5, 0.5, 0.5, 1.0]))
+    with pytest.raises(lx.SimulationError, match=r"Contact 'post' is 0\.018 m deep, nine tenths of both radii"):
+        lx.simulate(mechanism, start, t1=2.0 / start.v[0], saveat=diffrax.SaveAt(t1=True))
+
+
 @pytest.mark.parametrize(
     ("words", "make"),
     [
@@ -210,6 +243,7 @@ def test_derivatives_through_contacts():
         ("both shapes are planes", lambda a: lx.Contact(lx.Plane(a), lx.Plane(lx.GROUND), LAW)),
         ("start is on body 'a', end on 'ground'", lambda a: lx.Capsule(a, lx.GROUND, 1.0)),
         ("radius .* is -1.0", lambda a: lx.Sphere(a, -1.0)),
+        ("sum of both radii .* is 0.0", lambda a: lx.Contact(lx.Sphere(a, 0.0), lx.Sphere(lx.GROUND, 0.0), LAW)),
         ("body 'a': both frames are on it", lambda a: lx.Clearance(a, a, clearance=0.1, radius=1.0, law=LAW)),
         ("clearance .* is 0.0", lambda a: lx.Clearance(lx.GROUND, a, clearance=0.0, radius=1.0, law=LAW)),
     ],

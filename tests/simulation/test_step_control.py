@@ -27,7 +27,7 @@ ARGS = SimpleNamespace(
     unpacked=lambda y: (y[:2], y[2:4]),
     internal=lambda y: None,
     scales=(SCALES, SCALES),
-    can_go_on=lambda y: True,
+    can_go_on=lambda t, y: True,
     times=None,
 )
 Y = jnp.array([1.0, 2e3, 3.0, 4e3, 0.0])
@@ -150,7 +150,7 @@ def test_from_a_state_that_is_not_sound_no_step_is_taken(monkeypatch):
     for controller in (CONTROLLERS[0], diffrax.ConstantStepSize()):
         *_, result = adapt(controller, FAR)
         assert result == diffrax.RESULTS.successful
-        monkeypatch.setattr(ARGS, "can_go_on", lambda y: False)
+        monkeypatch.setattr(ARGS, "can_go_on", lambda t, y: False)
         keep, *_, result = adapt(controller, FAR)
         assert not keep
         assert result == diffrax.RESULTS.dt_min_reached

@@ -155,6 +155,9 @@ class ElasticRope(AbstractForce):
         slower = self.damping / self.stiffness * self._rate_of_stretch(motion)
         return (stretch + jnp.minimum(slower, 0.0)) / self.free_length
 
+    def separation(self, configuration: Configuration) -> Scalar:
+        return -self._stretch(configuration) / self.free_length
+
     def strength(self, t: Number, motion: Motion, on: Any) -> Scalar:
         stretch, rate = self._stretch(motion.configuration), self._rate_of_stretch(motion)
         return jnp.where(on, self.stiffness * stretch + self.damping * rate, 0.0)

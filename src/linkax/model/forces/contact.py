@@ -12,12 +12,14 @@ from linkax.model.bodies import BodyOrFrame, Frame, frame_of
 from linkax.model.elements import Configuration, Motion
 from linkax.model.forces.contact_law import ContactLaw
 from linkax.model.forces.force import AbstractForce, Load, described, named
-from linkax.model.forces.shapes import Shape, ShapePair, Spot
+from linkax.model.forces.shapes import Shape, ShapePair, Spot, smallest_gap
 from linkax.model.names import optional_name
 from linkax.model.numbers import Number, positive, require_type
 from linkax.spatial.vectors import dot, length
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
+
+NEARLY = 0.999  # of a depth: what counts as there
 
 
 class SurfaceContact(AbstractForce):
@@ -51,14 +53,35 @@ class SurfaceContact(AbstractForce):
             found.append((spot, velocity, normal if len(spots) == 1 else jnp.maximum(normal, 0.0) * (spot.gap < 0.0)))
         return [(spot, velocity, jnp.where(on, normal, 0.0)) for spot, velocity, normal in found]
 
+    @property
+    def deepest(self) -> Scalar | None:
+        """The penetration up to which the law is one of two surfaces [m]; None for any."""
+        return None
+
     def switch(self, t: Number, motion: Motion) -> Scalar:
-        """Positive where a surface pushes."""
+        """Positive where a surface pushes, and no deeper than `deepest`."""
         unit = motion.system.length
-        each = [
-            self.law.presses(-spot.gap, self._approach(motion, spot)[1], unit)
-            for spot in self.spots(motion.configuration)
-        ]
-        return jnp.max(jnp.stack(each))
+        spots = self.spots(motion.configuration)
+        each = [self.law.presses(-spot.gap, self._approach(motion, spot)[1], unit) for spot in spots]
+        pushes = jnp.max(jnp.stack(each))
+        return pushes if self.deepest is None else jnp.minimum(pushes, (self.deepest + smallest_gap(spots)) / unit)
+
+    def separation(self, configuration: Configuration) -> Scalar:
+        return smallest_gap(self.spots(configuration)) / configuration.system.length
+
+    def pressed_through(self, configuration: Configuration) -> Any:
+        # Steps end there, but for rounding.
+        return self.deepest is not None and -smallest_gap(self.spots(configuration)) > NEARLY * self.deepest
+
+    def exhausted(self, configuration: Configuration) -> str:
+        if not self.pressed_through(configuration):
+            return ""
+        depth = float(-smallest_gap(self.spots(configuration)))
+        energy = float(self.potential_energy(configuration))
+        return (
+            f"{self.display_name} is {depth:.3g} m deep, nine tenths of both radii, where its law has taken up "
+            f"{energy:.3g} J besides friction and damping."
+        )
 
     def strength(self, t: Number, motion: Motion, on: Any) -> Scalar:
         return sum((normal for _, _, normal in self._normal_forces(motion, on)), jnp.zeros((), motion.system.dtype))
@@ -94,6 +117,9 @@ class Contact(SurfaceContact):
     pass no thin obstacle, see `linkax.Impact`. What the law costs, and when to take `linkax.Impact` or another
     simulator instead, see `linkax.ContactLaw`.
 
+    A run ends with `RESULTS.pressed_through` where spheres or capsules penetrate by nine tenths of the sum of their
+    radii: beyond, the law would push them out on the other side.
+
     `Solution.force` has the normal force [N], of both ends in sum.
 
     **Arguments:** `first`, `second`: `linkax.Sphere`, `Capsule` or `Plane`, one of them no plane; `law`: a
@@ -121,6 +147,10 @@ class Contact(SurfaceContact):
 
     def spots(self, configuration: Configuration) -> list[Spot]:
         return self.shapes.spots(configuration)
+
+    @property
+    def deepest(self) -> Scalar | None:
+        return self.shapes.deepest
 
 
 class Clearance(SurfaceContact):

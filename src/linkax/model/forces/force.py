@@ -93,6 +93,10 @@ class AbstractForce(AbstractElement):
         """Whether all of its work is the fall of its potential energy, whatever its numbers."""
         return False
 
+    def pressed_through(self, configuration: Configuration) -> Any:
+        """Whether it has let bodies through each other, so that no motion leads on; never by default."""
+        return False
+
     def exhausted(self, configuration: Configuration) -> str:
         """Say why no motion may lead on from a configuration, where a run has failed; an empty string by default."""
         return ""
@@ -117,7 +121,8 @@ class AbstractForce(AbstractElement):
     def switch(self, t: Time, motion: Motion, *args: Any) -> Scalar | None:
         """Compute a number that changes sign where the load has a kink or jumps; None for a smooth load.
 
-        In any unit. The motion must go through zero there, and not be pushed back from both sides.
+        In any unit. The motion must go through zero there, and not be pushed back from both sides. Where the load is
+        zero on one side, give there how far the motion is from it, and no rates, which hide it from long steps.
         """
         return None
 
@@ -125,6 +130,13 @@ class AbstractForce(AbstractElement):
     def has_switch(self) -> bool:
         """Whether its load has a kink or jumps; by default whether its class defines `switch`."""
         return type(self).switch is not AbstractForce.switch
+
+    def separation(self, configuration: Configuration) -> Scalar | None:
+        """How far it is from where it may act, in the unit of its switch; None where the switch alone tells.
+
+        For elements whose switch is also negative where bodies part fast, which tells nothing of what is ahead.
+        """
+        return None
 
     def switched(self, t: Time, motion: Motion) -> Float[jax.Array, ""]:
         """Compute the switch and check it.
@@ -224,6 +236,12 @@ class Bound(AbstractForce):
 
     def switch(self, t: Time, motion: Motion) -> Scalar | None:
         return self.element.switch(t, motion, self.named)
+
+    def separation(self, configuration: Configuration) -> Scalar | None:
+        return self.element.separation(configuration)
+
+    def pressed_through(self, configuration: Configuration) -> Any:
+        return self.element.pressed_through(configuration)
 
     def potential_energy(self, configuration: Configuration) -> Scalar:
         return self.element.potential_energy(configuration, self.named)

@@ -116,6 +116,9 @@ class JointLimit(AlongJoint):
         depth, rate, _ = self._penetration(motion)
         return self.law.presses(depth, rate, self.range.unit(motion.configuration))
 
+    def separation(self, configuration: Configuration) -> Scalar:
+        return self.range.gap(configuration) / self.range.unit(configuration)
+
     def strength(self, t: Number, motion: Motion, on: Any) -> Scalar:
         depth, rate, sign = self._penetration(motion)
         return jnp.where(on, sign * self.law.normal(depth, rate), 0.0)

@@ -1,5 +1,6 @@
 """Shapes of bodies that touch, where two of them are nearest, and how far apart they are there."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,11 +10,12 @@ from jaxtyping import Float
 
 from linkax.model.bodies import BodyOrFrame, Frame, frame_of
 from linkax.model.elements import Configuration
-from linkax.model.numbers import Number, require_type, zero_or_more
+from linkax.model.numbers import Number, positive, require_type, zero_or_more
 from linkax.spatial.vectors import dot, length
 from linkax.xla.arrays import Scalar
 from linkax.xla.derivatives import ratio
 
+DEEPEST = 0.9  # of the sum of both radii: just before middles pass each other, where the normal turns round
 PARALLEL = 1e-12  # sine squared between two segments, below which their middles count as nearest
 
 
@@ -91,6 +93,11 @@ class Spot(NamedTuple):
     arms: tuple[Float[jax.Array, "3"], Float[jax.Array, "3"]]
 
 
+def smallest_gap(spots: Sequence[Spot]) -> Scalar:
+    """The smallest gap of some places [m]."""
+    return jnp.min(jnp.stack([spot.gap for spot in spots]))
+
+
 class ShapePair(eqx.Module):
     """Two shapes on two bodies, a plane second."""
 
@@ -107,6 +114,8 @@ class ShapePair(eqx.Module):
             raise ValueError(f"{what}: both shapes are planes; give a Sphere or a Capsule for one")
         if first.frame.body == second.frame.body:
             raise ValueError(f"{what}: both shapes are on body {first.frame.body!r}; give shapes of two bodies")
+        if not isinstance(second, Plane):
+            positive(first.radius + second.radius, f"{what}: the sum of both radii [m]", "give one of them, or both")
         self.first, self.second = first, second
 
     @property
@@ -122,7 +131,12 @@ class ShapePair(eqx.Module):
 
     def gap(self, configuration: Configuration) -> Scalar:
         """Compute the smallest gap [m]."""
-        return jnp.min(jnp.stack([spot.gap for spot in self.spots(configuration)]))
+        return smallest_gap(self.spots(configuration))
+
+    @property
+    def deepest(self) -> Scalar | None:
+        """How deep they penetrate just before they are through each other [m]; None in a plane."""
+        return None if isinstance(self.second, Plane) else DEEPEST * (self.first.radius + self.second.radius)
 
     def unit(self, configuration: Configuration) -> Scalar:
         """The mechanism's length [m]."""

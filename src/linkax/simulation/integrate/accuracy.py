@@ -81,7 +81,7 @@ DRAFT = Accuracy(rtol=1e-4)
 """For a first look: errors of 1e-4 to 1e-2 m, 0.4 to 1 times the cost of `BALANCED`."""
 
 BALANCED = Accuracy(rtol=1e-8)
-"""The default: errors of 6e-8 to 2e-6 m. Where `linkax.Solution.error_estimate` tells of more than you allow, take
+"""The default: errors of 4e-8 to 2e-6 m. Where `linkax.Solution.error_estimate` tells of more than you allow, take
 `PRECISE`, or a tolerance between them."""
 
 PRECISE = Accuracy(rtol=1e-12)

@@ -39,7 +39,7 @@ class StepError(NamedTuple):
     - `opens`: the largest gap of the loops on the way, where states between steps are read before they are corrected
       [rad, lengths of the mechanism], at its end as many times that as less is allowed there; None without loops.
     - `switch`: by how much to shorten the step so that it ends at the first switch of a force element that it goes
-      past, one for none; None where there are none.
+      past, or before an event would be passed over, one for neither; None where there are none.
     - `turns`: how fast joints turn between bodies whose force elements switch, at the faster of its ends [rad/s]; None
       without such elements.
     - `locks`: one where it leads up to where the mechanism locks, else zero: diffrax makes numbers of all of these.

@@ -25,7 +25,8 @@ from linkax.xla.derivatives import ratio
 
 Problem = Any  # that of `linkax.simulation.integrate.problem`, which imports `switches`
 
-RESTS, DRIVEN_IN = -1.0, -2.0
+RESTS = -1.0
+DRIVEN_IN = -2.0
 
 
 def impacts_of(mechanism: Mechanism | System) -> list[Impact]:

@@ -110,15 +110,16 @@ def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     q, v, internal = initial.state.q, initial.state.v, initial.state.internal
     sides = start_sides(bound(problem.system, internal), t0, q, v) if control.is_adaptive else ()
     y0, event = problem.packed(q, v, sides, internal), _wrapped_event(options.event)
-    solver = ProjectedSolver.around(options.solver, run.accuracy, run.adjoint, control)
+    solver = ProjectedSolver.around(options.solver, run.accuracy, run.adjoint, control, event)
     meter = diffrax.NoProgressMeter() if options.progress_meter is None else options.progress_meter
     integrator = Integrator(dt0, saveat, solver, control, run.adjoint, event, meter, options.max_steps)
     saved = saveat.subs.ts if run.has_discrete_adjoint else None
     solve = integrate if run.has_discrete_adjoint else solve_by_diffrax
     integrated, _ = solve(InitialValueProblem(problem, y0, t0, t1, saved), integrator, False)
-    result = integrated.result
-    if impacts_of(problem.system):
-        result = _at_stop(result, problem.system, jnp.asarray(problem.sides(integrated.y_end)))
+    result = _at_stop(integrated.result, problem, integrated.t_end, integrated.y_end)
+    if event is not None and event.root_finder is not None:
+        gives_up = (result == RESULTS.nonlinear_max_steps_reached) | (result == RESULTS.nonlinear_divergence)
+        result = RESULTS.where(gives_up, RESULTS.event_without_root, result)
     result = _result(result, initial, in_order, control.is_adaptive)
     integrated = integrated._replace(result=result)
     return _without_derivatives(integrated, event, inputs)
@@ -153,6 +154,11 @@ class _OnManifold(eqx.Module):
         state, holds = args.close(t, y)
         return self.function(t, infinite_where(jnp.logical_not(holds), state, y), args.mechanism)
 
+    def unclosed(self, t: Float[Array, ""], y: Float[Array, " n"], args: Problem) -> Any:
+        """The same of a state that is not closed first."""
+        q, v = args.unpacked(y)
+        return self.function(t, State(q, v, args.system.topology, args.internal(y)), args.mechanism)
+
 
 def _wrapped_saves(subs):
     is_sub = lambda node: isinstance(node, diffrax.SubSaveAt)
@@ -170,10 +176,16 @@ def _wrapped_event(event):
     return eqx.tree_at(lambda e: e.cond_fn, event, jax.tree.map(_OnManifold, event.cond_fn, is_leaf=callable))
 
 
-def _at_stop(result, system, kept):
-    """How a run ended, by what y keeps of switches, where no motion led on from a stop."""
+def _at_stop(result, problem, t, y):
+    """How a run ended, by the vector y of its end, where no motion led on from a stop or a contact."""
+    system = problem.system
+    stands = result == RESULTS.dt_min_reached
+    result = RESULTS.where(problem.pressed_through(t, y) & stands, RESULTS.pressed_through, result)
+    if not impacts_of(system):
+        return result
+    kept = jnp.asarray(problem.sides(y))
     ended = RESULTS.where(is_driven_in(system, kept), RESULTS.driven_into_stop, RESULTS.rests_on_stop)
-    return RESULTS.where(has_ended(system, kept) & (result == RESULTS.dt_min_reached), ended, result)
+    return RESULTS.where(has_ended(system, kept) & stands, ended, result)
 
 
 def _result(result, initial: InitialCheck, in_order: Bool[Array, ""], is_adaptive: bool):

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Bool, Float
 
 from linkax.equations.configuration import configure
-from linkax.equations.constraint_rows import constraint_rate, constraint_residual, is_driven
+from linkax.equations.constraint_rows import constraint_rate, constraint_residual
 from linkax.equations.coordinates import on_manifold, rates, speeds
 from linkax.equations.internal_states import bound, internal_rates, num_states
 from linkax.equations.loops import widest
@@ -22,7 +22,7 @@ from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import integral_of_distance, pack, unpack
 from linkax.simulation.integrate.impacts import has_ended, impacts_of
-from linkax.simulation.integrate.switches import Sides, held, turning, values
+from linkax.simulation.integrate.switches import Sides, are_apart, held, turning, values
 from linkax.simulation.start.state import State
 from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
@@ -53,12 +53,8 @@ class Problem(eqx.Module):
     until: Float[Array, ""] | None = None
 
     def stage_time(self, t: Float[Array, ""], until: Float[Array, ""] | None) -> Float[Array, ""]:
-        """The time of a stage, just before the end of its step: steps end where laws may jump.
-
-        Not with drives: where one turns back next to where the mechanism locks, the loops that its last stage opens are
-        all that tells of a step too long.
-        """
-        if self.times is None or until is None or is_driven(self.system):
+        """The time of a stage, just before the end of its step: steps end where laws may jump."""
+        if self.times is None or until is None:
             return t
         end = lax.stop_gradient(until)
         return jnp.minimum(t, until + (jnp.nextafter(end, -jnp.inf) - end))
@@ -104,15 +100,27 @@ class Problem(eqx.Module):
         first = len(self.sides(y)) + self.system.topology.num_coordinates
         return jnp.asarray(y).at[first : first + len(v)].set(v)
 
-    def can_go_on(self, y: Float[Array, " n"]) -> Bool[Array, ""] | bool:
+    def can_go_on(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Bool[Array, ""] | bool:
         """Whether a step may be taken from a vector."""
+        goes_on = self.can_start & jnp.logical_not(self.pressed_through(t, y))
         if not impacts_of(self.system):
-            return self.can_start
-        return self.can_start & jnp.logical_not(has_ended(self.system, jnp.asarray(self.sides(y))))
+            return goes_on
+        return goes_on & jnp.logical_not(has_ended(self.system, jnp.asarray(self.sides(y))))
 
-    def switches(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Values of the switches at a vector, (m,)."""
-        return values(bound(self.system, self.internal(y)), t, *self.unpacked(y))
+    def pressed_through(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Bool[Array, ""]:
+        """Whether bodies are pressed through each other at a vector."""
+        configuration = configure(self.system, t, self.unpacked(y)[0])
+        return jnp.any(jnp.array([force.pressed_through(configuration) for force in self.system.forces], bool))
+
+    def switches(
+        self, t: Float[Array, ""], y: Float[Array, " n"], apart: Bool[Array, " m"] | None = None
+    ) -> Float[Array, " m"]:
+        """Values of the switches at a vector, (m,), see `switches.values`."""
+        return values(bound(self.system, self.internal(y)), t, *self.unpacked(y), apart)
+
+    def are_apart(self, t: Float[Array, ""], y: Float[Array, " n"], least: Float[Array, " m"]) -> Bool[Array, " m"]:
+        """Which elements with a switch are from where they may act, (m,), see `switches.are_apart`."""
+        return are_apart(self.system, t, *self.unpacked(y), least)
 
     def turning(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, ""] | None:
         """How fast joints between bodies whose force elements switch turn at a vector [rad/s]; None without such."""
@@ -159,9 +167,9 @@ class Problem(eqx.Module):
     @jit_inline
     @straight_line
     def drives_on(self, t: Float[Array, ""], y: Float[Array, " n"], ahead: Float[Array, ""]) -> Float[Array, ""]:
-        """How long drives would take at their speeds now to go as far as they go in a time ahead [s]."""
+        """How long drives would take at their speeds so far to go as far as they go in a time ahead [s]."""
         q, _ = self.unpacked(y)
-        asked = constraint_rate(configure(self.system, t, q))
+        asked = constraint_rate(configure(self.system, self.stage_time(t, t), q))
         asked = jnp.where(self.system.topology.slips[-len(asked) :], 0.0, asked)
         return ratio(-(asked @ constraint_residual(configure(self.system, t + ahead, q))), asked @ asked, 0.0)
 

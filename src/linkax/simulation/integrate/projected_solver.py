@@ -18,6 +18,7 @@ from linkax.equations.constraint_rows import is_driven
 from linkax.model.numbers import Number
 from linkax.simulation.integrate.accuracy import Accuracy
 from linkax.simulation.integrate.diffrax_contract import SolverState, StepError, stage_distances
+from linkax.simulation.integrate.events import until_next_change
 from linkax.simulation.integrate.placement import Placement, lock_ahead
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.step_control import OPENS, MechanismControl
@@ -29,6 +30,7 @@ from linkax.xla.tracing import without_derivatives
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
 STAGNATES = 0.9  # rate at which they no longer fall
 CLOSED = 1e-5  # radians, or lengths of the mechanism: what corrections leave open at the end of a step, at most
+ON_BRANCH = 0.1  # of d at its end: the error of a step of a driven motion, at most, else it may end on another branch
 ON_THE_WAY = np.array([0.3, 0.6, 0.9])  # of a step: where loops are looked at
 # Times the way to where a mechanism locks: where drives are looked at, and how far they must have gone then.
 BEYOND, AT_LEAST = 1.5, 1.3
@@ -111,13 +113,15 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
     in the state. The rest is mostly rounding, which a singular configuration amplifies and the
     correction removes; a step control that saw it would stall.
 
-    - `after_step`: whether to correct. `is_undifferentiated`: no transformation will differentiate its steps.
+    - `event`: where steps must not pass over it. `after_step`: whether to correct.
+    - `is_undifferentiated`: no transformation will differentiate its steps.
 
     Not an `AbstractWrappedSolver`: diffrax would look through it for fields it does not have.
     """
 
     solver: diffrax.AbstractSolver
     tolerances: tuple[Array, Array] | None
+    event: diffrax.Event | None
     after_step: bool = eqx.field(static=True)
     is_undifferentiated: bool = eqx.field(static=True)
 
@@ -125,7 +129,11 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
 
     @staticmethod
     def around(
-        solver: diffrax.AbstractSolver, accuracy: Accuracy, adjoint: diffrax.AbstractAdjoint, control: MechanismControl
+        solver: diffrax.AbstractSolver,
+        accuracy: Accuracy,
+        adjoint: diffrax.AbstractAdjoint,
+        control: MechanismControl,
+        event: diffrax.Event | None,
     ) -> "ProjectedSolver":
         """Wrap a solver.
 
@@ -139,7 +147,9 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
         # What is no number stands for the tolerances of the step control.
         lacks = finder is not None and not eqx.is_array_like(finder.rtol)
         tolerances = control.tolerances((accuracy.rtol, accuracy.atol)) if lacks else None
-        return ProjectedSolver(solver, tolerances, accuracy.projection in ("both", "step"), control.is_undifferentiated)
+        event = event if control.is_adaptive else None
+        after_step = accuracy.projection in ("both", "step")
+        return ProjectedSolver(solver, tolerances, event, after_step, control.is_undifferentiated)
 
     def _stepping(self, problem, t0, y0, duration):
         """The solver for one step: its root finder measures iterates as errors of the step are measured."""
@@ -230,15 +240,29 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             *between, end = jax.vmap(args.opens)(times, jnp.concatenate([jax.vmap(within)(on_the_way), y1[None]]))
             # No motion goes on from loops that are not closed, such as past where a mechanism locks.
             at_most = jnp.maximum(CLOSED, jnp.sqrt(jnp.finfo(end.dtype).eps))
-            opens = lax.stop_gradient(jnp.max(jnp.stack([*between, OPENS / at_most * end])))
+            opens = jnp.max(jnp.stack([*between, OPENS / at_most * end]))
+            if is_driven(args.system) and error is not None:
+                # Of a motion that drives leave no freedom, the correction takes all of the error, wherever it leads to.
+                uncorrected = args.system.fastest(args.errors(y1, error)[0])
+                opens = jnp.maximum(opens, OPENS * uncorrected / jnp.maximum(ON_BRANCH * arrives, CLOSED))
+            opens = lax.stop_gradient(opens)
+        corrected = y1
+
+        def closed(share):
+            """Corrected as the end is: a root between a motion and its end is none that a shorter step comes to."""
+            return within(t0 + share * (t1 - t0)) + share * (corrected - stepped)
+
         if switching:
-            # Corrected as its end is: a root between a motion and its end is none that a shorter step would come to.
-            closed = lambda share: within(t0 + share * (t1 - t0)) + share * (y1 - stepped)
             fixed = without_derivatives((args, t0, t1, y0, y1))
             switch, sides = lax.stop_gradient(meet(*fixed, within=closed))
-            begins, ends = (fixed[0].turning(*end) for end in ((t0, y0), (t1, y1)))
-            turns = None if begins is None else lax.stop_gradient(jnp.maximum(begins, ends))
+            problem, *ends = fixed
+            turns = jax.vmap(problem.turning)(jnp.stack(ends[:2]), jnp.stack(ends[2:]))
+            turns = None if turns is None else lax.stop_gradient(jnp.max(turns))
             _, y1 = crossed(args, t1, y1, sides, "nothing" if self.is_undifferentiated else "state")
+        if self.event is not None:
+            event, *fixed = without_derivatives((self.event, args, t0, t1))
+            share = until_next_change(event, *fixed, within=closed, after=y1)
+            switch = share if switch is None else jnp.minimum(switch, share)
         state = SolverState(inner, arrives, closest, locked)
         of_step = StepError(errors, leaves, placement, opens, switch, turns, locked.astype(t1.dtype))
         return y1, of_step, dense_info, state, result

@@ -71,6 +71,15 @@ with warnings.catch_warnings():
             "A drive leads into the stop of a `linkax.Impact`: the loops and the drive leave no impulse that would "
             "change how fast the gap closes. Move the stop, let the drive turn back before it, or end the run before."
         )
+        event_without_root = (
+            "The root finder finds no zero of the event's condition where that changes sign: it jumps there, as "
+            "speeds do at an impact, or the root finder's tolerance is out of reach. Leave `root_finder` out, and the "
+            "run ends just after."
+        )
+        pressed_through = (
+            "Bodies are pressed through each other: their energy is larger than what the law of a `linkax.Contact` "
+            "takes up over their radii. Take a larger stiffness, larger radii, or a `linkax.Impact`."
+        )
         not_reached = "The branch does not lead to all values: it turns back before, or ends where another one crosses."
 
 
@@ -91,6 +100,8 @@ KNOWN_RESULTS = (
     "locked",
     "rests_on_stop",
     "driven_into_stop",
+    "event_without_root",
+    "pressed_through",
     "not_reached",
 )
 

@@ -26,7 +26,8 @@ SMALLEST_STEP_ULPS = 4.0
 MOST_RETRIES = 4
 # Radians that joints may turn in a step between bodies whose force elements switch, and beyond which it is tried again:
 # what comes back with each turn would be passed over between two samples of a step that has no error to shorten it.
-TURN, TURN_AT_MOST = 4.0, 6.0
+TURN = 4.0
+TURN_AT_MOST = 6.0
 
 
 class ControlState(NamedTuple):
@@ -129,7 +130,7 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         )
         # A step size that is not a number does not proceed either.
         proceeds = next_t1 - next_t0 > SMALLEST_STEP_ULPS * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t1), 1e-3)
-        goes_on = args.can_go_on(y0)
+        goes_on = args.can_go_on(t0, y0)
         keep = keep & goes_on
         result = diffrax.RESULTS.where(keep | (proceeds & goes_on), result, diffrax.RESULTS.dt_min_reached)
         if not self.is_adaptive:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from linkax.equations.configuration import configure
 from linkax.equations.coordinates import retract
@@ -30,7 +30,9 @@ from linkax.xla.derivatives import positive_or_one, ratio
 
 SAMPLES = 8  # of a step, and of a window of it
 WINDOWS = 64  # of a step that are looked at
-ON_ULPS = 256.0  # what counts as there, in units of what rounding of the state changes
+KEPT = 8  # of these that are kept, with intervals that wait to be looked at
+ON_ULPS = 1024.0  # what counts as there, in units of what rounding of the state changes
+BEYOND_ULPS = 512.0  # how far beyond a switch a step ends: an event with the same condition sees it on the other side
 START_ULPS = 1e5  # how far beyond a stop a run may begin, as rounding of its assembly
 TIME_ULPS = 8.0
 JUMPS = 1.25  # times the changes beside it: what no convex value has, nor one that is a little concave beside a kink
@@ -65,10 +67,30 @@ def held(system: System, sides: Sides) -> System:
     return dataclasses.replace(system, forces=forces, known=None)
 
 
-def values(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Float[Array, " m"]:
-    """Values of all switches of force elements, (m,)."""
+def values(
+    system: System,
+    t: Float[Array, ""],
+    q: Float[Array, " n_q"],
+    v: Float[Array, " n_v"],
+    apart: Bool[Array, " m"] | None = None,
+) -> Float[Array, " m"]:
+    """Values of all switches of force elements, (m,); of those `apart` how far they are from where they may act."""
     motion = move(configure(system, t, q), v)
-    return jnp.stack([force.switched(t, motion) for force in system.forces if force.has_switch])
+    switches = jnp.stack([force.switched(t, motion) for force in system.forces if force.has_switch])
+    return switches if apart is None else jnp.where(apart, -_separations(system, motion), switches)
+
+
+def are_apart(
+    system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"], least: Float[Array, " m"]
+) -> Bool[Array, " m"]:
+    """Which force elements with a switch are so far, or farther, from where they may act, (m,); see `values`."""
+    return _separations(system, move(configure(system, t, q), v)) > least
+
+
+def _separations(system, motion):
+    """Of force elements with a switch, (m,); −∞ where the switch alone tells."""
+    found = [force.separation(motion.configuration) for force in system.forces if force.has_switch]
+    return jnp.stack([jnp.asarray(-jnp.inf if each is None else each, system.dtype) for each in found])
 
 
 def start_sides(system: System, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]) -> Sides:
@@ -88,7 +110,8 @@ def turning(
     """How fast the joints between the bodies of a force element turn, all of them together, of the element where it is
     most [rad/s]; None where no element with a switch attaches to bodies.
     """
-    path, between = system.topology.path, []
+    path = system.topology.path
+    between = []
     for force in system.forces:
         if force.has_switch and (frames := force.itself.frames):
             ways = path[[system.topology.body_index(frame.body) for frame in frames]]
@@ -103,20 +126,19 @@ class _Search(NamedTuple):
     """A search for the first place of a step past a switch, in a window of it at a time.
 
     - `count`: of windows. `left`: values of the switches at samples of the whole step, (SAMPLES + 1, m).
-    - `pending`: intervals between them in which a switch may be passed and come back, (SAMPLES, m).
-    - `switch`, `ends`: the window looked at, for one switch, by shares of the step.
+    - `windows`: ends of the first window and the latest ones, by shares of the step, (KEPT, 2).
+    - `lowest`: how low each switch may be in the intervals between their samples that wait to be looked at, (KEPT,
+      SAMPLES, m), as it may be passed and come back there; infinite for all others.
     - `before`, `past`: (share, least value), of the last sample before a switch is passed, and the first after it.
     """
 
     count: Array
     left: Array
-    pending: Array
-    switch: Array
-    ends: tuple[Array, Array]
+    windows: Array
+    lowest: Array
     before: tuple[Array, Array]
     past: tuple[Array, Array]
     finds: Array
-    goes_on: Array
 
 
 def meet(
@@ -139,11 +161,16 @@ def meet(
     stops, num = impacts.places(problem.system), sum(force.has_switch for force in problem.system.forces)
     sides = kept[:num]
     duration = t1 - t0
-    at_end = problem.switches(t1, y1)
     # In units of what rounding makes of each, so that the unit of a switch does not matter.
-    ulps = sides / positive_or_one(eps * _sensitivity(problem, t0, t1, y0, y1, at_end))
-    inside = lambda share: ulps * problem.switches(t0 + share * duration, within(share))
-    at_end = ulps * at_end
+    ulps = sides / positive_or_one(eps * _sensitivity(problem, t0, t1, y0, y1, problem.switches(t1, y1)))
+    # A switch that looks at how fast bodies part is far from zero as soon as they have passed each other.
+    apart = (sides < 0.0) & problem.are_apart(t0, y0, ON_ULPS / ulps)
+
+    def inside(share):
+        """Values of the switches at a share of the step, positive on the sides where it begins."""
+        return ulps * problem.switches(t0 + share * duration, within(share), apart)
+
+    at_end = ulps * problem.switches(t1, y1, apart)
     search = _searched(inside, at_end, 2.0 * TIME_ULPS * eps)
 
     def closer(carry):
@@ -151,7 +178,7 @@ def meet(
         # From where the switch is as good as there, and leaves it, to where it comes back.
         leaves = of_a <= ON_ULPS
         c = jnp.where(leaves, (a + b) / 2.0, jnp.clip(b - of_b * (b - a) / (of_b - of_a), a, b))
-        of_c = jnp.min(inside(c))
+        of_c = jnp.min(inside(c)) + BEYOND_ULPS
         # False position, which halves the value of an end that stays (the Illinois method).
         before = of_c > 0.0
         ends = jax.tree.map(
@@ -159,7 +186,7 @@ def meet(
             ((c, of_c), (b, of_b / 2.0)),
             ((a, of_a / 2.0), (c, of_c)),
         )
-        found = (jnp.abs(of_c) <= ON_ULPS / 4.0) & ~(leaves & before)
+        found = (jnp.abs(of_c) <= BEYOND_ULPS / 8.0) & ~(leaves & before)
         return jnp.where(found | (b <= a), ITERATIONS, count + 1), *ends, c
 
     (a, of_a), past = search.before, search.past
@@ -203,67 +230,82 @@ def _searched(inside, at_end, narrowest) -> _Search:
     """Look for the first sample past a switch: of the step, then of intervals in which one may be passed and come back.
 
     Between two samples a value may fall as fast as it changes beside them, and no faster while the gap of two convex
-    bodies, or what else is convex in time, is small. Intervals in which that may lead past zero are sampled, until one
-    sample is past it or none may be. `narrowest`: the share of a step that is as good as nothing.
+    bodies, or what else is convex in time, is small. Intervals in which that may lead past zero are sampled, those
+    where it may lead farthest first, until one sample is past it or none may be. `narrowest`: the share of a step that
+    is as good as nothing.
     """
     places = jnp.asarray(np.linspace(0.0, 1.0, SAMPLES + 1), at_end.dtype)
-    zero, one = jnp.zeros_like(at_end[0]), jnp.ones_like(at_end[0])
+    zero = jnp.zeros_like(at_end[0])
+    one = jnp.ones_like(at_end[0])
     num = len(at_end)
 
     def look(search):
-        a, b = search.ends
         first = search.count == 0
-        shares = a + places * (b - a)
+        window, interval, switch = jnp.unravel_index(jnp.argmin(search.lowest), search.lowest.shape)
+        a, b = search.windows[window]
+        shares = jnp.where(first, places, a + (places + interval) / SAMPLES * (b - a))
         values = jax.vmap(inside)(shares)
         values = values.at[-1].set(jnp.where(first, at_end, values[-1]))
         nearest = jnp.min(values, axis=1)
         past = nearest[1:] < -ON_ULPS
-        finds, place = jnp.any(past), jnp.argmax(past)
+        place = jnp.argmax(past)
         slack, lowest = _between(values)
-        pending = jnp.where(first, slack < 0.0, search.pending)
-        # Of the switch looked at, the interval where it may go farthest past; where there is none, a pending one.
-        deeper = ~first & jnp.any(slack[:, search.switch] < 0.0) & ((b - a) > narrowest)
-        chosen = jnp.argmin(lowest[:, search.switch])
-        waiting = jnp.argmax(pending.reshape(-1))
-        interval, switch = waiting // num, waiting % num
-        ends = (
-            jnp.where(deeper, shares[chosen], places[interval]),
-            jnp.where(deeper, shares[chosen + 1], places[interval + 1]),
-        )
+        may_pass = (slack < 0.0) & (first | (np.arange(num) == switch)) & (shares[1] - shares[0] > narrowest)
+        begins = (shares[0] == 0.0) & _rises_straight(values)
+        ends = (shares[-1] == 1.0) & _rises_straight(values[::-1])
+        may_pass = may_pass.at[0].set(may_pass[0] & ~begins).at[-1].set(may_pass[-1] & ~ends)
+        slot = jnp.where(first, 0, 1 + search.count % (KEPT - 1))
+        waiting = search.lowest.at[window, interval, switch].set(jnp.inf)
+        waiting = waiting.at[slot].set(jnp.where(may_pass, lowest, jnp.inf))
+        fails = jnp.logical_not(jnp.all(jnp.isfinite(values)))
         return _Search(
             search.count + 1,
             jnp.where(first, values, search.left),
-            jnp.where(deeper, pending, pending.at[interval, switch].set(False)),
-            jnp.where(deeper, search.switch, switch),
-            ends,
+            search.windows.at[slot].set(shares[jnp.array([0, SAMPLES])]),
+            jnp.where(fails, jnp.inf, waiting),
             (shares[place], nearest[place]),
             (shares[place + 1], nearest[place + 1]),
-            finds,
-            ~finds & (deeper | jnp.any(pending)),
+            jnp.any(past),
         )
+
+    def goes_on(search):
+        waits = (search.count == 0) | jnp.any(search.lowest < jnp.inf)
+        return waits & ~search.finds & (search.count < WINDOWS)
 
     begin = _Search(
         jnp.zeros((), int),
         jnp.zeros((SAMPLES + 1, num), at_end.dtype),
-        jnp.zeros((SAMPLES, num), bool),
-        jnp.zeros((), int),
-        (zero, one),
+        jnp.zeros((KEPT, 2), at_end.dtype),
+        jnp.full((KEPT, SAMPLES, num), jnp.inf, at_end.dtype),
         (zero, zero),
         (one, one),
         jnp.zeros((), bool),
-        jnp.ones((), bool),
     )
-    return lax.while_loop(lambda search: search.goes_on & (search.count < WINDOWS), look, begin)
+    return lax.while_loop(goes_on, look, begin)
+
+
+def _rises_straight(values):
+    """Whether values rise from a switch where they begin, in a straight line, (m,): else the steps before and after a
+    contact begins or ends are searched there down to rounding.
+    """
+    rise = values[1] - values[0]
+    next_rise = values[2] - values[1]
+    is_straight = (rise < JUMPS * next_rise) & (next_rise < JUMPS * rise)
+    return (values[0] <= ON_ULPS) & (rise > 0.0) & is_straight
 
 
 def _between(values):
     """How far values stay from zero between each two samples, at least, negative where they may pass, (SAMPLES, m); and
     how low they are there where they are convex in time, with kinks, or jump up, (SAMPLES, m).
     """
-    one, other, changes = values[:-1], values[1:], jnp.abs(jnp.diff(values, axis=0))
-    steepest = lambda ends: jnp.max(changes[ends], axis=0, keepdims=True)
-    beside = jnp.concatenate([steepest(slice(2)), changes, steepest(slice(-2, None))])
-    before, after, nearest = beside[:-2], beside[2:], jnp.minimum(one, other)
+    one = values[:-1]
+    other = values[1:]
+    nearest = jnp.minimum(one, other)
+    changes = jnp.abs(jnp.diff(values, axis=0))
+    at_begin = jnp.max(changes[:2], axis=0, keepdims=True)
+    at_end = jnp.max(changes[-2:], axis=0, keepdims=True)
+    before = jnp.concatenate([at_begin, changes[:-1]])
+    after = jnp.concatenate([changes[1:], at_end])
     most = jnp.maximum(before, after)
     # Lines that go on as steep as they are beside meet below what is convex; in it no change is larger than both are.
     meeting = ratio(after * one + before * other - before * after, before + after, nearest)

@@ -205,8 +205,12 @@ def _polished(solution, pair, time, q) -> _Passage:
         ends = [Samples(at_ends(ts, k), at_ends(qs, k), at_ends(vs, k), pair.distances[None]) for k in (1, 2)]
         f, g = (_between(solution, end, np.ones(1))[0][0].smallest() for end in ends)
         share = -f / (g - f) if g != f else 0.5
-        before, time, q = time, ts[1] + share * (ts[2] - ts[1]), qs[1] + share * (qs[2] - qs[1])
-        accuracy = abs(time - before)
+        polished = ts[1] + share * (ts[2] - ts[1])
+        if not pair.ts[0] <= polished <= pair.ts[1]:  # where a motion comes close, and none of its states is singular
+            break
+        accuracy = abs(polished - time)
+        time = polished
+        q = qs[1] + share * (qs[2] - qs[1])
     return _Passage(float(time), q, float(accuracy))
 
 
