@@ -1,6 +1,10 @@
-"""No program calls LAPACK for a batch, on a CPU: such calls may wait for each other for ever."""
+"""No program calls LAPACK for a batch on a CPU, as such calls may wait for each other for ever; and in one thread."""
 
 import dataclasses
+import json
+import os
+import subprocess
+import sys
 
 import equinox as eqx
 import jax
@@ -16,6 +20,12 @@ from linkax.formulations.named import COMPARED, TANGENT_SPACE, formulation
 from linkax.simulation.read.passages import between_states
 
 COUNT = 3
+THREADS = """
+import json, jax, linkax, threadpoolctl
+jax.numpy.linalg.cholesky(jax.numpy.eye(3))
+libraries = threadpoolctl.ThreadpoolController().select(user_api="blas").info()
+print(json.dumps({"numpy" in library["filepath"]: library["num_threads"] for library in libraries}))
+"""
 
 
 def batched_calls(function, *args):
@@ -44,6 +54,17 @@ def times(mechanism, state, count):
 def large():
     """Twenty four-bars, with more speeds than elimination serves."""
     return start("n-four-bar", "A02", {"N": 20})
+
+
+@pytest.mark.skipif(os.cpu_count() == 1, reason="one thread in any case")
+@pytest.mark.parametrize(("environment", "threads"), [({}, 1), ({"OPENBLAS_NUM_THREADS": "2"}, 2)])
+def test_lapack_uses_one_thread_unless_the_environment_says_otherwise(environment, threads):
+    others = {name: value for name, value in os.environ.items() if not name.endswith("NUM_THREADS")}
+    told = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, env=others | environment)
+    assert told.returncode == 0, told.stderr
+    of_numpy = json.loads(told.stdout)
+    assert of_numpy["false"] == threads
+    assert of_numpy.get("true", 2) > 1
 
 
 def test_the_test_sees_them():

@@ -24,6 +24,7 @@ from jaxtyping import PyTree
 from linkax.files import written_whole
 from linkax.xla.descriptions import description, of_libraries, of_processor, of_settings, settings
 from linkax.xla.flat import Flat
+from linkax.xla.lapack_threads import use_one_thread
 from linkax.xla.memory_maps import CACHES, make_room
 
 FOUND = "/jax/compilation_cache/cache_hits"  # what JAX tells its listeners where it reads a program from its files
@@ -124,6 +125,7 @@ def _read(place, given):
 def _load_lapack():
     """Have JAX load LAPACK, as it does where it lowers a call; programs that come from disk crash without."""
     jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
+    use_one_thread()
 
 
 def _new(place, lowered):
