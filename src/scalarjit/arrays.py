@@ -1,0 +1,320 @@
+"""Arrays of scalars: entry by entry, in memory, or told by what their entries are."""
+
+import math
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+
+from scalarjit.graph import INDEX, Buffer, Copy, Graph, Index, Region, Store, as_scalar, constant, number_of, value_of
+
+Number = int | np.ndarray | Index  # a place along an axis, or those of many entries
+LINE = 8  # entries of an innermost axis up to which loops over memory are unrolled
+
+NONE = np.int64(2**62)  # in place of a scalar that is not known
+
+_places = np.zeros(0, np.int64)
+
+
+def _places_up_to(count):
+    """Scalars of 0, ..., count − 1."""
+    global _places
+    if len(_places) < count:
+        _places = np.array([constant(place) for place in range(2 * count)], np.int64)
+    return _places
+
+
+def are_known(index: tuple[Number, ...]) -> bool:
+    """Whether places are known before the program runs."""
+    return not any(isinstance(number, Index) for number in index)
+
+
+def ravelled(index: tuple[Number, ...], shape: tuple[int, ...]) -> Number:
+    """The place of an entry in memory, row by row."""
+    place: Number = 0
+    for number, size in zip(index, shape, strict=True):
+        place = place * size + number
+    return place
+
+
+def unravelled(place: Number, shape: tuple[int, ...]) -> tuple[Number, ...]:
+    index: list[Number] = []
+    for size in reversed(shape):
+        if size == 1:
+            index.append(place * 0)
+            continue
+        rest = place // size
+        index.append(place - rest * size)
+        place = rest
+    return tuple(reversed(index))
+
+
+def by_entry(element: Callable[[tuple[Number, ...]], int]) -> Callable[[tuple[Number, ...]], Any]:
+    """Ask for entries one by one, of a function that takes no arrays of indices."""
+
+    def at(index):
+        if not any(isinstance(number, np.ndarray) for number in index):
+            return element(index)
+        parts = np.broadcast_arrays(*index)
+        found = [element(each) for each in zip(*(part.ravel().tolist() for part in parts), strict=True)]
+        return np.array(found, np.int64).reshape(parts[0].shape)
+
+    return at
+
+
+def numbers_of(graph: Graph, scalars: Any) -> Any:
+    """The places that scalars are: integers where all are constants, an index of one that is not, else None."""
+    if isinstance(scalars, np.ndarray) and scalars.shape:
+        if np.any(scalars >= 0):
+            return None
+        different, places = np.unique(scalars, return_inverse=True)
+        return np.array([int(value_of(scalar)) for scalar in different.tolist()])[places].reshape(scalars.shape)
+    return number_of(graph, graph.op(("convert", INDEX), int(scalars)))
+
+
+def every(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """The indices of all entries."""
+    return tuple(np.indices(shape)) if shape else ()
+
+
+def chosen(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
+    """One of two places, or arrays of them."""
+    if isinstance(condition, Index):
+        return number_of(graph, graph.op("select", condition.scalar, as_scalar(yes), as_scalar(no)))
+    if isinstance(condition, np.ndarray):
+        return np.where(condition, yes, no)
+    return yes if condition else no
+
+
+def chosen_scalars(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
+    """One of two scalars, or arrays of them. What is not chosen is not computed, where that is known."""
+    if isinstance(condition, Index):
+        return graph.map("select", condition.scalar, yes(), no())
+    if isinstance(condition, np.ndarray):
+        return np.where(condition, yes(), no())
+    return yes() if condition else no()
+
+
+class Array:
+    """An array of scalars of a graph.
+
+    - `home`: the region that it was made in. What is written to memory of it is written there, once, however deep in
+      loops it is asked for.
+    """
+
+    is_steady = True  # whether to ask for an entry often costs no more than to ask for it once
+
+    def __init__(self, graph: Graph, shape: tuple[int, ...], dtype: np.dtype) -> None:
+        self.graph = graph
+        self.shape = tuple(shape)
+        self.dtype = np.dtype(dtype)
+        self.size = math.prod(self.shape)
+        self.home: Region = graph.region
+        self._stored: Stored | None = None
+
+    def at(self, index: tuple[Number, ...]) -> Any:
+        """Give the scalar at an index, or those at many that are known."""
+        raise NotImplementedError
+
+    def scalars(self) -> np.ndarray:
+        """Give all scalars."""
+        return np.asarray(self.at(every(self.shape)))
+
+    def steady(self) -> "Array":
+        """The same array, such that to ask for an entry often costs no more than once."""
+        return self if self.is_steady else self.stored()
+
+    def stored(self) -> "Stored":
+        """The same array in memory."""
+        if self._stored is None:
+            with self.graph.inside(self.home):
+                buffer = Buffer(self.dtype, self.size)
+                self.write(buffer)
+                self._stored = Stored(self.graph, self.shape, buffer)
+        return self._stored
+
+    def write(self, buffer: Buffer, *, blended: bool = False) -> None:
+        """Write all entries to memory, here."""
+        raise NotImplementedError
+
+    def _write_by_loops(self, buffer, blended):
+        graph = self.graph
+
+        def along(axis, index, place):
+            if axis == len(self.shape):
+                graph.do(Store(buffer, as_scalar(place), self.at(index), blended))
+                return
+            size = self.shape[axis]
+            if axis == len(self.shape) - 1 and size <= LINE:
+                for number in range(size):
+                    along(axis + 1, (*index, number), place * size + number)
+                return
+
+            def one(scalar):
+                number = number_of(graph, scalar)
+                along(axis + 1, (*index, number), place * size + number)
+                return ()
+
+            graph.loop(size, (), one)
+
+        along(0, (), 0)
+
+
+class Entries(Array):
+    """Each entry is a scalar of its own."""
+
+    def __init__(self, graph: Graph, scalars: Any, dtype: np.dtype) -> None:
+        self.ids = np.asarray(scalars, np.int64)
+        super().__init__(graph, self.ids.shape, dtype)
+
+    def at(self, index: tuple[Number, ...]) -> Any:
+        if are_known(index):
+            found = self.ids[cast(Any, index)]
+            return found if isinstance(found, np.ndarray) and found.shape else int(found)
+        if self.size == 1:
+            return int(self.ids.reshape(-1)[0])
+        return self.stored().at(index)
+
+    def scalars(self) -> np.ndarray:
+        return self.ids
+
+    def stored(self) -> "Stored":
+        if self._stored is None and np.all(self.ids < 0):
+            self._stored = Stored(self.graph, self.shape, constant_buffer(self.ids, self.dtype), self.ids)
+        found = super().stored()
+        found.known = self.ids
+        return found
+
+    def write(self, buffer: Buffer, *, blended: bool = False) -> None:
+        places = _places_up_to(self.size)
+        for place, scalar in enumerate(self.ids.ravel().tolist()):
+            self.graph.do(Store(buffer, int(places[place]), scalar, blended))
+
+
+class Stored(Array):
+    """An array in memory, row by row. `known`: scalars of its entries, and `NONE` for those that memory alone knows."""
+
+    def __init__(self, graph: Graph, shape: tuple[int, ...], buffer: Buffer, known: np.ndarray | None = None) -> None:
+        super().__init__(graph, shape, buffer.dtype)
+        self.buffer = buffer
+        self.known = known if known is not None and np.any(known != NONE) else None
+
+    def at(self, index: tuple[Number, ...]) -> Any:
+        graph = self.graph
+        place = ravelled(index, self.shape)
+        if isinstance(place, Index):
+            return graph.op(("load", self.buffer), place.scalar)
+        place = np.asarray(place)
+        name = ("load", self.buffer)
+        if self.known is None:
+            found = graph.map(name, _places_up_to(self.size)[place])
+        else:
+            found = np.array(self.known.reshape(-1)[place])
+            unknown = found == NONE
+            if np.any(unknown):
+                found[unknown] = graph.map(name, _places_up_to(self.size)[place[unknown]])
+        return found if np.shape(found) else int(found)
+
+    def stored(self) -> "Stored":
+        return self
+
+    def write(self, buffer: Buffer, *, blended: bool = False) -> None:
+        self.graph.do(Copy(buffer, self.buffer, blended))
+
+
+class Delayed(Array):
+    """Entries are computed where they are asked for. `element`: index -> scalar, or those of many known indices."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        shape: tuple[int, ...],
+        dtype: np.dtype,
+        element: Callable[[tuple[Number, ...]], Any],
+        *,
+        is_steady: bool = False,
+    ) -> None:
+        super().__init__(graph, shape, dtype)
+        self._element = element
+        self.is_steady = is_steady
+
+    def at(self, index: tuple[Number, ...]) -> Any:
+        return self._element(index)
+
+    def write(self, buffer: Buffer, *, blended: bool = False) -> None:
+        self._write_by_loops(buffer, blended)
+
+
+class Updated(Array):
+    """An array in memory, of which some entries are others: those of a window that begins somewhere.
+
+    What it is made of may become it by writing the window alone.
+    """
+
+    is_steady = False
+
+    def __init__(self, base: Array, start: tuple[Number, ...], window: Array) -> None:
+        super().__init__(base.graph, base.shape, base.dtype)
+        self.base = base
+        self.start = start
+        self.window = window
+
+    def at(self, index: tuple[Number, ...]) -> Any:
+        return self._one(index) if are_known(self.start) else by_entry(self._one)(index)
+
+    def _one(self, index):
+        inside: Any = True
+        places = []
+        for number, start, size in zip(index, self.start, self.window.shape, strict=True):
+            place = number - start
+            within = (place >= 0) & (place < size)
+            inside = within if inside is True else inside & within
+            places.append((place, within))
+        places = [chosen(self.graph, within, place, 0) for place, within in places]
+        return chosen_scalars(self.graph, inside, lambda: self.window.at(tuple(places)), lambda: self.base.at(index))
+
+    def write(self, buffer: Buffer, *, blended: bool = False) -> None:
+        if not (isinstance(self.base, Stored) and self.base.buffer is buffer):
+            self.base.write(buffer, blended=blended)
+        self.write_window(buffer, blended)
+
+    def write_window(self, buffer: Buffer, blended: bool) -> None:
+        """Write what is others."""
+        graph = self.graph
+        window = self.window.steady()
+
+        def one(scalar):
+            inner = unravelled(number_of(graph, scalar), window.shape)
+            index = tuple(start + number for start, number in zip(self.start, inner, strict=True))
+            place = ravelled(index, self.shape)
+            graph.do(Store(buffer, as_scalar(place), window.at(inner), blended))
+            return ()
+
+        if window.size <= LINE:
+            for place in range(window.size):
+                one(constant(place, INDEX))
+        else:
+            graph.loop(window.size, (), one)
+
+
+def known_of(array: Array) -> np.ndarray | None:
+    """The scalars of entries that are known without a look into memory, and `NONE` for others; None where none is."""
+    if isinstance(array, Entries):
+        return array.ids
+    return array.known if isinstance(array, Stored) else None
+
+
+def constants_of(array: Array) -> np.ndarray | None:
+    """The constants among the entries of an array, and `NONE` for others; None where there are none."""
+    known = known_of(array)
+    if known is None:
+        return None
+    found = np.where(known < 0, known, NONE)
+    return found if np.any(known < 0) else None
+
+
+def constant_buffer(scalars: np.ndarray, dtype: np.dtype) -> Buffer:
+    """Constants in memory."""
+    flat = scalars.ravel()
+    data = np.array([value_of(scalar) for scalar in flat.tolist()], dtype)
+    return Buffer(dtype, flat.size, "constant", data=data)

@@ -1,0 +1,397 @@
+"""From graphs to the text of LLVM's language, for one member or for the members of a batch in vectors.
+
+A function has the signature (arguments..., results..., memory, cell): pointers to arrays, memory of its own and for
+what it calls, and its cell: [address of its code, number of calls, cells of what it calls...]. It calls by way of
+cells, so that better code can take a function's place while programs run, and so that its text is the same in each
+process.
+
+In vectors each entry of an array takes as many places in memory as a vector has members, one after another. Constants
+in memory, and what follows from them alone, are the same for all members and stay scalars.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scalarjit.function import Function
+from scalarjit.graph import BOOL, Buffer, Call, Copy, For, If, Region, Store, While, value_of
+from scalarjit.instructions import Instructions
+from scalarjit.operations import memory_type
+from scalarjit.writer import literal, mangled
+
+ALIGNMENT = 64  # of arrays in memory, in bytes
+CALLEES = 2  # entries of a cell before those of what the function calls
+
+
+@dataclass
+class Code:
+    """The text of a function, the functions that it calls, in the order of its cell, and the memory of its own."""
+
+    text: str
+    callees: list[Function]
+    own_memory: int
+
+
+def emitted(function: Function, lanes: int, symbol: str) -> Code:
+    """Write a function for a number of members at once."""
+    return _Emission(function, lanes).code(symbol)
+
+
+class _Emission(Instructions):
+    def __init__(self, function: Function, lanes: int) -> None:
+        super().__init__(function.graph, lanes)
+        self.function = function
+        self.mask: str | None = None  # members that take a branch, or go on
+        self.places: dict[int, str] = {}
+        self.constants: dict[int, tuple[Buffer, str]] = {}
+        self.expanded: dict[int, Buffer] = {}  # constants as vectors
+        self.callees: list[Function] = []
+        self.own_memory = 0
+        self.used = _used(function)
+
+    def code(self, symbol: str) -> Code:
+        function = self.function
+        parameters = []
+        for number, buffer in enumerate(function.passed):
+            self.places[id(buffer)] = f"%a{number}"
+            parameters.append(f"ptr noalias readonly %a{number}")
+        for number, buffer in enumerate(function.buffers):
+            self.places[id(buffer)] = f"%r{number}"
+            parameters.append(f"ptr noalias %r{number}")
+        parameters += ["ptr %memory", "ptr %cell"]
+        self.counts(1)
+        self.region(function.graph.root)
+        self.lines.append("ret void")
+        body = "\n".join(self.lines).replace("@OWN@", str(self.own_memory))
+        globals_ = "\n".join(
+            f"{name}.{symbol} = private constant [{buffer.size} x {memory_type(buffer.dtype)}] {_array(buffer)}"
+            for buffer, name in self.constants.values()
+        )
+        for _, name in self.constants.values():
+            body = body.replace(f"{name}@", f"{name}.{symbol}")
+        counted = "%counter = getelementptr i64, ptr %cell, i64 1"
+        declarations = "\n".join(sorted(self.declared))
+        head = f"define void @{symbol}({', '.join(parameters)}) nounwind {{\nentry:\n{counted}\n"
+        text = f"{globals_}\n{declarations}\n{head}{body}\n}}\n"
+        return Code(text, self.callees, self.own_memory)
+
+    # Memory.
+
+    def place(self, buffer: Buffer) -> str:
+        """The address of an array."""
+        found = self.places.get(id(buffer))
+        if found is not None:
+            return found
+        if buffer.kind == "constant":
+            name = f"@c{len(self.constants)}"
+            self.constants[id(buffer)] = buffer, name
+            self.places[id(buffer)] = f"{name}@"
+            return f"{name}@"
+        buffer_bytes = max(buffer.size, 1) * np.dtype(memory_dtype(buffer)).itemsize * self.lanes
+        offset = self.own_memory
+        self.own_memory += -(-buffer_bytes // ALIGNMENT) * ALIGNMENT
+        self.places[id(buffer)] = f"getelementptr:{offset}"
+        return self.places[id(buffer)]
+
+    def address(self, buffer: Buffer) -> str:
+        place = self.place(buffer)
+        if place.startswith("getelementptr:"):
+            return self.value(f"getelementptr i8, ptr %memory, i64 {place[14:]}")
+        return place
+
+    def scaled(self, buffer: Buffer) -> int:
+        return 1 if buffer.kind == "constant" else self.lanes
+
+    def entry(self, buffer: Buffer, offset: int) -> str:
+        """The address of an entry, or of its vector."""
+        scale = self.scaled(buffer)
+        kind = memory_type(buffer.dtype)
+        place = self.place(buffer)
+        if offset < 0 and place.startswith("getelementptr:"):
+            size = np.dtype(memory_dtype(buffer)).itemsize
+            return self.value(
+                f"getelementptr i8, ptr %memory, i64 {int(place[14:]) + int(value_of(offset)) * scale * size}"
+            )
+        base = self.address(buffer)
+        if offset < 0:
+            return self.value(f"getelementptr {kind}, ptr {base}, i64 {int(value_of(offset)) * scale}")
+        if self.is_uniform(offset):
+            number = f"%v{offset}" if scale == 1 else self.value(f"mul i64 %v{offset}, {scale}")
+            return self.value(f"getelementptr {kind}, ptr {base}, i64 {number}")
+        places = f"%v{offset}"
+        if scale > 1:
+            steps = ", ".join(f"i64 {lane}" for lane in range(self.lanes))
+            times = self.value(f"mul {self.vector('i64')} {places}, splat (i64 {scale})")
+            places = self.value(f"add {self.vector('i64')} {times}, <{steps}>")
+        return self.value(f"getelementptr {kind}, ptr {base}, {self.vector('i64')} {places}")
+
+    def loaded(self, scalar: int) -> None:
+        graph = self.graph
+        _, buffer = graph.names[scalar]
+        (offset,) = graph.operands[scalar]
+        of = memory_type(buffer.dtype)
+        address = self.entry(buffer, offset)
+        gathers = not self.is_uniform(offset)
+        if gathers:
+            self.declared.add(
+                f"declare {self.vector(of)} @llvm.masked.gather.v{self.lanes}{mangled(of)}.v{self.lanes}p0"
+                f"({self.vector('ptr')}, i32, {self.vector('i1')}, {self.vector(of)})"
+            )
+            mask = f"{self.vector('i1')} splat (i1 true)"
+            text = (
+                f"call {self.vector(of)} @llvm.masked.gather.v{self.lanes}{mangled(of)}.v{self.lanes}p0"
+                f"({self.vector('ptr')} {address}, i32 {_alignment(buffer)}, {mask}, {self.vector(of)} poison)"
+            )
+            kind = self.vector(of)
+        else:
+            kind = self.type(scalar).replace("i1", "i8") if buffer.dtype == BOOL else self.type(scalar)
+            text = f"load {kind}, ptr {address}, align {_alignment(buffer)}"
+        if buffer.dtype == BOOL:
+            byte = self.value(text)
+            zero = "zeroinitializer" if kind.startswith("<") else "0"
+            self.line(f"%v{scalar} = icmp ne {kind} {byte}, {zero}")
+        else:
+            self.line(f"%v{scalar} = {text}")
+
+    def stored(self, store: Store) -> None:
+        buffer = store.buffer
+        of = memory_type(buffer.dtype)
+        one = self.lanes == 1
+        kind = of if one else self.vector(of)
+        value = self.operand(store.value, uniform=one)
+        if buffer.dtype == BOOL:
+            if store.value < 0:
+                byte = "1" if value_of(store.value) else "0"
+                value = byte if one else f"splat (i8 {byte})"
+            else:
+                value = self.value(f"zext {self.type(store.value, uniform=one)} {value} to {kind}")
+        address = self.entry(buffer, store.offset)
+        align = _alignment(buffer)
+        if not self.is_uniform(store.offset):
+            self.declared.add(
+                f"declare void @llvm.masked.scatter.v{self.lanes}{mangled(of)}.v{self.lanes}p0"
+                f"({kind}, {self.vector('ptr')}, i32, {self.vector('i1')})"
+            )
+            mask = self.mask if store.blended and self.mask else "splat (i1 true)"
+            self.line(
+                f"call void @llvm.masked.scatter.v{self.lanes}{mangled(of)}.v{self.lanes}p0"
+                f"({kind} {value}, {self.vector('ptr')} {address}, i32 {align}, {self.vector('i1')} {mask})"
+            )
+            return
+        if store.blended and self.mask:
+            old = self.value(f"load {kind}, ptr {address}, align {align}")
+            value = self.value(f"select {self.vector('i1')} {self.mask}, {kind} {value}, {kind} {old}")
+        self.line(f"store {kind} {value}, ptr {address}, align {align}")
+
+    def copied(self, copy: Copy) -> None:
+        source, target = copy.source, copy.target
+        if source is target or not source.size:
+            return
+        if self.lanes > 1 and (source.kind == "constant" or (copy.blended and self.mask)):
+            self.copied_by_vectors(copy)
+            return
+        size = source.size * np.dtype(memory_dtype(source)).itemsize * self.lanes
+        self.declared.add("declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)")
+        to, from_ = self.address(target), self.address(source)
+        self.line(f"call void @llvm.memcpy.p0.p0.i64(ptr {to}, ptr {from_}, i64 {size}, i1 false)")
+
+    def copied_by_vectors(self, copy: Copy) -> None:
+        of = memory_type(copy.source.dtype)
+        vector = self.vector(of)
+        to, from_ = self.address(copy.target), self.address(copy.source)
+        align = _alignment(copy.source)
+
+        def one(index: str) -> None:
+            if copy.source.kind == "constant":
+                address = self.value(f"getelementptr {of}, ptr {from_}, i64 {index}")
+                new = self.splat(self.value(f"load {of}, ptr {address}, align {align}"), of)
+            else:
+                address = self.value(f"getelementptr {vector}, ptr {from_}, i64 {index}")
+                new = self.value(f"load {vector}, ptr {address}, align {align}")
+            target = self.value(f"getelementptr {vector}, ptr {to}, i64 {index}")
+            if copy.blended and self.mask:
+                old = self.value(f"load {vector}, ptr {target}, align {align}")
+                new = self.value(f"select {self.vector('i1')} {self.mask}, {vector} {new}, {vector} {old}")
+            self.line(f"store {vector} {new}, ptr {target}, align {align}")
+
+        self.counted(copy.source.size, one)
+
+    def counted(self, count: int, body: Any) -> None:
+        """A loop over 0, ..., count − 1 of lines."""
+        before, head, inner, after = self.block, self.label(), self.label(), self.label()
+        index = f"%{self.label()}"
+        following = f"{index}n"
+        self.begin(head)
+        at = len(self.lines)
+        self.lines.append("")
+        test = self.value(f"icmp slt i64 {index}, {count}")
+        self.begin(inner, after=f"br i1 {test}, label %{inner}, label %{after}")
+        body(index)
+        self.line(f"{following} = add i64 {index}, 1")
+        last = self.block
+        self.lines[at] = f"{index} = phi i64 [0, %{before}], [{following}, %{last}]"
+        self.begin(after, after=f"br label %{head}")
+
+    # Regions.
+
+    def region(self, region: Region) -> None:
+        for item in region.items:
+            if isinstance(item, int):
+                if item in self.used:
+                    self.scalar(item)
+            elif isinstance(item, Store):
+                self.stored(item)
+            elif isinstance(item, Copy):
+                self.copied(item)
+            elif isinstance(item, For):
+                self.for_(item)
+            elif isinstance(item, While):
+                self.while_(item)
+            elif isinstance(item, If):
+                self.if_(item)
+            else:
+                self.called(item)
+
+    def scalar(self, scalar: int) -> None:
+        name = self.graph.names[scalar]
+        if name in ("index", "carried"):  # written by loops
+            return
+        if isinstance(name, tuple) and name[0] == "load":
+            if self.lanes > 1 and name[1].kind == "constant" and self.is_uniform(self.graph.operands[scalar][0]):
+                self.uniform.add(scalar)
+            self.loaded(scalar)
+        else:
+            self.operation(scalar)
+
+    def for_(self, loop: For) -> None:
+        before, head, inner, after = self.block, self.label(), self.label(), self.label()
+        index = f"%v{loop.index}"
+        self.uniform.add(loop.index)
+        carried = [(scalar, first, then) for scalar, first, then in loop.carried if scalar in self.used]
+        firsts = [self.operand(first, uniform=self.lanes == 1) for _, first, _ in carried]
+        before = self.block
+        self.begin(head)
+        at = len(self.lines)
+        self.lines.extend([""] * (1 + len(carried)))
+        test = self.value(f"icmp slt i64 {index}, {loop.count}")
+        self.begin(inner, after=f"br i1 {test}, label %{inner}, label %{after}")
+        self.region(loop.region)
+        thens = [self.operand(then, uniform=self.lanes == 1) for _, _, then in carried]
+        self.line(f"{index}n = add i64 {index}, 1")
+        last = self.block
+        self.lines[at] = f"{index} = phi i64 [0, %{before}], [{index}n, %{last}]"
+        for number, ((scalar, _, _), first, then) in enumerate(zip(carried, firsts, thens, strict=True)):
+            kind = self.type(scalar)
+            self.lines[at + 1 + number] = f"%v{scalar} = phi {kind} [{first}, %{before}], [{then}, %{last}]"
+        self.begin(after, after=f"br label %{head}")
+        self.counts(loop.count)
+
+    def counts(self, number: int) -> None:
+        """Count passes of loops as calls: what makes many of them is worth better code."""
+        calls = self.value("load i64, ptr %counter")
+        self.line(f"store i64 {self.value(f'add i64 {calls}, {number}')}, ptr %counter")
+
+    def while_(self, loop: While) -> None:
+        head, inner, after = self.label(), self.label(), self.label()
+        outer = self.mask
+        self.begin(head)
+        self.region(loop.test)
+        taken = self.taken(loop.goes_on)
+        self.begin(inner, after=f"br i1 {taken}, label %{inner}, label %{after}")
+        self.region(loop.region)
+        self.counts(1)
+        self.begin(after, after=f"br label %{head}")
+        self.mask = outer
+
+    def if_(self, branch: If) -> None:
+        inner, after = self.label(), self.label()
+        outer = self.mask
+        taken = self.taken(branch.condition)
+        self.begin(inner, after=f"br i1 {taken}, label %{inner}, label %{after}")
+        self.region(branch.region)
+        self.begin(after)
+        self.mask = outer
+
+    def taken(self, condition: int) -> str:
+        """Whether any member takes a branch, which becomes the mask."""
+        if self.is_uniform(condition):
+            return self.operand(condition)
+        mask = self.operand(condition, uniform=False)
+        if self.mask:
+            mask = self.value(f"and {self.vector('i1')} {mask}, {self.mask}")
+        self.mask = mask
+        self.declared.add(f"declare i1 @llvm.vector.reduce.or.v{self.lanes}i1({self.vector('i1')})")
+        return self.value(f"call i1 @llvm.vector.reduce.or.v{self.lanes}i1({self.vector('i1')} {mask})")
+
+    def called(self, call: Call) -> None:
+        function = call.function
+        if function not in self.callees:
+            self.callees.append(function)
+        addresses = []
+        for buffer in call.arguments:
+            if self.lanes > 1 and buffer.kind == "constant":
+                if id(buffer) not in self.expanded:
+                    self.expanded[id(buffer)] = Buffer(buffer.dtype, buffer.size)
+                room = self.expanded[id(buffer)]
+                self.copied_by_vectors(Copy(room, buffer))
+                buffer = room
+            addresses.append(self.address(buffer))
+        addresses += [self.address(buffer) for buffer in call.results]
+        memory = self.value("getelementptr i8, ptr %memory, i64 @OWN@")
+        slot = self.value(f"getelementptr ptr, ptr %cell, i64 {CALLEES + self.callees.index(function)}")
+        cell = self.value(f"load ptr, ptr {slot}")
+        code = self.value(f"load ptr, ptr {cell}")
+        given = ", ".join(f"ptr {address}" for address in [*addresses, memory, cell])
+        self.line(f"call void {code}({given})")
+
+
+def memory_dtype(buffer: Buffer) -> np.dtype:
+    return np.dtype(np.uint8) if buffer.dtype == BOOL else buffer.dtype
+
+
+def _alignment(buffer):
+    return memory_dtype(buffer).itemsize
+
+
+def _array(buffer):
+    kind = memory_type(buffer.dtype)
+    data = buffer.data.astype(memory_dtype(buffer))
+    if not np.any(data.view(f"u{data.itemsize}")):
+        return "zeroinitializer"
+    return "[" + ", ".join(f"{kind} {literal(value)}" for value in data) + "]"
+
+
+def _used(function: Function) -> set[int]:
+    """The scalars that results, memory, loops and branches need."""
+    graph = function.graph
+    used: set[int] = set()
+    loops: dict[int, tuple[int, int]] = {}
+    waiting: list[int] = []
+
+    def roots(region: Region) -> None:
+        for item in region.items:
+            if isinstance(item, Store):
+                waiting.extend((item.offset, item.value))
+            elif isinstance(item, For):
+                waiting.append(item.index)
+                for scalar, first, then in item.carried:
+                    loops[scalar] = first, then
+                roots(item.region)
+            elif isinstance(item, While):
+                waiting.append(item.goes_on)
+                roots(item.test)
+                roots(item.region)
+            elif isinstance(item, If):
+                waiting.append(item.condition)
+                roots(item.region)
+
+    roots(graph.root)
+    while waiting:
+        scalar = waiting.pop()
+        if scalar < 0 or scalar in used:
+            continue
+        used.add(scalar)
+        waiting.extend(graph.operands[scalar])
+        waiting.extend(loops.get(scalar, ()))
+    return used

@@ -1,0 +1,108 @@
+"""Factorisations of matrices, for which JAX calls LAPACK, in operations that have rules."""
+
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+UNROLLED = 12  # rows of a matrix up to which each is written by itself
+
+
+def _each_row(count, body, initial):
+    """body(row, found) for all rows in their order."""
+    if count <= UNROLLED:
+        for row in range(count):
+            initial = body(row, initial)
+        return initial
+    return lax.fori_loop(0, count, body, initial)
+
+
+def cholesky(matrix, **_params):
+    """L of A = L Lᵀ, of the lower triangle of A; not a number where A is not positive definite."""
+    count = len(matrix)
+    places = jnp.arange(count)
+
+    def column(number, lower):
+        row = lower[number]
+        below = matrix[:, number] - lower @ row
+        pivot = jnp.sqrt(below[number])
+        return lower.at[:, number].set(jnp.where(places >= number, below / pivot, 0.0))
+
+    return (_each_row(count, column, jnp.zeros_like(matrix)),)
+
+
+def triangular_solve(matrix, right, *, left_side, lower, transpose_a, conjugate_a, unit_diagonal):
+    """X of op(A) X = B, or of X op(A) = B."""
+    if not left_side:
+        matrix, right = matrix.T, right.T
+        lower = not lower
+    if transpose_a:
+        matrix = matrix.T
+        lower = not lower
+    count = len(matrix)
+    places = jnp.arange(count)
+
+    def solve(step, solved):
+        number = step if lower else count - 1 - step
+        row = jnp.where((places < number) if lower else (places > number), matrix[number], 0.0)
+        rest = right[number] - row @ solved
+        return solved.at[number].set(rest if unit_diagonal else rest / matrix[number, number])
+
+    solved = _each_row(count, solve, jnp.zeros_like(right))
+    return (solved if left_side else solved.T,)
+
+
+def lu(matrix, **_params):
+    """L and U of P A = L U in one matrix, pivots, the largest of their columns, and the permutation of rows."""
+    rows, columns = matrix.shape
+    places = jnp.arange(rows)
+
+    def step(number, found):
+        matrix, pivots, order = found
+        sizes = jnp.where(places >= number, jnp.abs(matrix[:, number]), -1.0)
+        pivot = jnp.argmax(sizes).astype(pivots.dtype)
+        pivots = pivots.at[number].set(pivot)
+        one, other = matrix[number], matrix[pivot]
+        matrix = matrix.at[number].set(other).at[pivot].set(one)
+        first, second = order[number], order[pivot]
+        order = order.at[number].set(second).at[pivot].set(first)
+        below = places > number
+        at = matrix[number, number]
+        factors = jnp.where(below & (at != 0.0), matrix[:, number] / at, matrix[:, number])
+        matrix = matrix.at[:, number].set(factors)
+        right = jnp.where(jnp.arange(columns) > number, matrix[number], 0.0)
+        return matrix - jnp.where(below, factors, 0.0)[:, None] * right, pivots, order
+
+    pivots = jnp.zeros(min(rows, columns), jnp.int32)
+    return _each_row(min(rows, columns), step, (matrix, pivots, jnp.arange(rows, dtype=jnp.int32)))
+
+
+def lu_pivots_to_permutation(pivots, *, permutation_size):
+    """The permutation that exchanges of rows make."""
+
+    def exchange(number, order):
+        pivot = pivots[number]
+        first, second = order[number], order[pivot]
+        return order.at[number].set(second).at[pivot].set(first)
+
+    return (_each_row(len(pivots), exchange, jnp.arange(permutation_size, dtype=jnp.int32)),)
+
+
+FACTORISATIONS = {
+    "cholesky": (cholesky, 2),
+    "triangular_solve": (triangular_solve, 2),
+    "lu": (lu, 2),
+    "lu_pivots_to_permutation": (lu_pivots_to_permutation, 1),
+}  # functions, and of how many axes their arrays are
+
+
+@lru_cache(maxsize=256)
+def traced(name: str, shapes: tuple[Any, ...], params: tuple[tuple[str, Any], ...]) -> Any:
+    """A factorisation as JAX traces it, of members of batches too."""
+    function, rank = FACTORISATIONS[name]
+    compute = lambda *arrays: function(*arrays, **dict(params))
+    for _ in range(len(shapes[0][0]) - rank):
+        compute = jax.vmap(compute)
+    return jax.make_jaxpr(compute)(*(jax.ShapeDtypeStruct(*shape) for shape in shapes))

@@ -1,0 +1,151 @@
+"""Instructions of LLVM for operations on scalars."""
+
+import numpy as np
+
+from scalarjit.graph import BOOL, value_of
+from scalarjit.operations import OPERATIONS, llvm_type
+from scalarjit.writer import Writer, mangled
+
+
+class Instructions(Writer):
+    """Operations of a graph as instructions."""
+
+    def operation(self, scalar: int) -> None:
+        """Write the operation of a scalar."""
+        graph = self.graph
+        name = graph.names[scalar]
+        operands = graph.operands[scalar]
+        uniform = all(map(self.is_uniform, operands))
+        if uniform and self.lanes > 1:
+            self.uniform.add(scalar)
+        result = self.type(scalar)
+        kind = self.type(operands[-1], uniform)
+        texts = [self.operand(operand, uniform or self.lanes == 1) for operand in operands]
+        own = f"%v{scalar}"
+        if isinstance(name, tuple):
+            self.line(f"{own} = {self.converted(graph.dtype(operands[0]), name[1], kind, result, texts[0])}")
+            return
+        dtype = graph.dtype(operands[-1])
+        known = OPERATIONS[name]
+        how = known.of_real if dtype.kind == "f" else known.of_signed if dtype.kind == "i" else known.of_unsigned
+        if how is None:
+            getattr(self, f"_{name}")(own, kind, dtype, texts)
+        elif how[0] == "@":
+            self.line(f"{own} = {self.intrinsic(how[1:], kind, texts)}")
+        elif how[0] == "!":
+            self.library(own, how[1:], kind, dtype, texts)
+        elif name in ("div", "rem") and dtype.kind != "f":
+            self.whole_division(own, name, how, kind, operands, texts)
+        else:
+            self.line(f"{own} = {how} {kind} {', '.join(texts)}")
+
+    def intrinsic(self, name: str, kind: str, texts: list[str]) -> str:
+        of = mangled(kind)
+        given = ", ".join(f"{kind} {text}" for text in texts)
+        self.declared.add(f"declare {kind} @llvm.{name}.{of}({', '.join([kind] * len(texts))})")
+        return f"call {kind} @llvm.{name}.{of}({given})"
+
+    def library(self, own: str, name: str, kind: str, dtype: np.dtype, texts: list[str]) -> None:
+        """A function of C, of each member."""
+        self.declared.add(f"declare double @{name}({', '.join(['double'] * len(texts))})")
+        single = dtype.itemsize == 4
+
+        def one(texts: list[str]) -> str:
+            if single:
+                texts = [self.value(f"fpext float {text} to double") for text in texts]
+            found = self.value(f"call double @{name}({', '.join(f'double {text}' for text in texts)})")
+            return self.value(f"fptrunc double {found} to float") if single else found
+
+        if not kind.startswith("<"):
+            of = llvm_type(dtype)
+            self.line(f"{own} = select i1 true, {of} {one(texts)}, {of} {texts[0]}")
+            return
+        of = llvm_type(dtype)
+        vector = "poison"
+        for lane in range(self.lanes):
+            parts = [self.value(f"extractelement {kind} {text}, i64 {lane}") for text in texts]
+            found = one(parts)
+            if lane == self.lanes - 1:
+                self.line(f"{own} = insertelement {kind} {vector}, {of} {found}, i64 {lane}")
+            else:
+                vector = self.value(f"insertelement {kind} {vector}, {of} {found}, i64 {lane}")
+
+    def whole_division(self, own, name, how, kind, operands, texts) -> None:
+        """As JAX has it, x / 0 = −1 and x % 0 = x; processors stop."""
+        if operands[1] < 0 and value_of(operands[1]) != 0:
+            self.line(f"{own} = {how} {kind} {', '.join(texts)}")
+            return
+        none, one, all_bits = self.number(kind, 0), self.number(kind, 1), self.number(kind, -1)
+        test = self.value(f"icmp eq {kind} {texts[1]}, {none}")
+        bools = self.vector("i1") if kind.startswith("<") else "i1"
+        safe = self.value(f"select {bools} {test}, {kind} {one}, {kind} {texts[1]}")
+        found = self.value(f"{how} {kind} {texts[0]}, {safe}")
+        other = all_bits if name == "div" else texts[0]
+        self.line(f"{own} = select {bools} {test}, {kind} {other}, {kind} {found}")
+
+    @staticmethod
+    def number(kind: str, value: int) -> str:
+        if kind.startswith("<"):
+            return f"splat ({kind[kind.index('x') + 2 : -1]} {value})"
+        return str(value)
+
+    def _neg(self, own, kind, dtype, texts) -> None:
+        if dtype.kind == "f":
+            self.line(f"{own} = fneg {kind} {texts[0]}")
+        else:
+            self.line(f"{own} = sub {kind} {self.number(kind, 0)}, {texts[0]}")
+
+    def _abs(self, own, kind, dtype, texts) -> None:
+        if dtype.kind == "f":
+            self.line(f"{own} = {self.intrinsic('fabs', kind, texts)}")
+        elif dtype.kind == "u":
+            self.line(f"{own} = add {kind} {texts[0]}, {self.number(kind, 0)}")
+        else:
+            negative = self.value(f"sub {kind} {self.number(kind, 0)}, {texts[0]}")
+            test = self.value(f"icmp slt {kind} {texts[0]}, {self.number(kind, 0)}")
+            bools = self.vector("i1") if kind.startswith("<") else "i1"
+            self.line(f"{own} = select {bools} {test}, {kind} {negative}, {kind} {texts[0]}")
+
+    def _not(self, own, kind, dtype, texts) -> None:
+        ones = "true" if dtype == BOOL else "-1"
+        ones = f"splat ({kind[kind.index('x') + 2 : -1]} {ones})" if kind.startswith("<") else ones
+        self.line(f"{own} = xor {kind} {texts[0]}, {ones}")
+
+    def _is_finite(self, own, kind, dtype, texts) -> None:
+        difference = self.value(f"fsub {kind} {texts[0]}, {texts[0]}")
+        zero = "zeroinitializer" if kind.startswith("<") else "0.0"
+        self.line(f"{own} = fcmp oeq {kind} {difference}, {zero}")
+
+    def _select(self, own, kind, dtype, texts) -> None:
+        bools = self.vector("i1") if kind.startswith("<") else "i1"
+        self.line(f"{own} = select {bools} {texts[0]}, {kind} {texts[1]}, {kind} {texts[2]}")
+
+    def _max(self, own, kind, dtype, texts, sign="gt") -> None:
+        bools = self.vector("i1") if kind.startswith("<") else "i1"
+        if dtype.kind != "f":
+            test = self.value(f"icmp {'s' if dtype.kind == 'i' else 'u'}{sign} {kind} {texts[0]}, {texts[1]}")
+            self.line(f"{own} = select {bools} {test}, {kind} {texts[0]}, {kind} {texts[1]}")
+            return
+        test = self.value(f"fcmp u{sign} {kind} {texts[0]}, {texts[1]}")
+        found = self.value(f"select {bools} {test}, {kind} {texts[0]}, {kind} {texts[1]}")
+        is_nan = self.value(f"fcmp uno {kind} {texts[1]}, {texts[1]}")
+        self.line(f"{own} = select {bools} {is_nan}, {kind} {texts[1]}, {kind} {found}")
+
+    def _min(self, own, kind, dtype, texts) -> None:
+        self._max(own, kind, dtype, texts, "lt")
+
+    def converted(self, from_: np.dtype, to: np.dtype, kind: str, result: str, text: str) -> str:
+        signed = from_.kind == "i"
+        if from_.kind == "f" and to.kind == "f":
+            return f"{'fpext' if to.itemsize > from_.itemsize else 'fptrunc'} {kind} {text} to {result}"
+        if to.kind == "f":
+            return f"{'sitofp' if signed else 'uitofp'} {kind} {text} to {result}"
+        if from_.kind == "f":
+            how = f"llvm.fpto{'s' if to.kind == 'i' else 'u'}i.sat.{mangled(result)}.{mangled(kind)}"
+            self.declared.add(f"declare {result} @{how}({kind})")
+            return f"call {result} @{how}({kind} {text})"
+        if from_ == BOOL or to.itemsize > from_.itemsize:
+            return f"{'sext' if signed else 'zext'} {kind} {text} to {result}"
+        if to.itemsize < from_.itemsize:
+            return f"trunc {kind} {text} to {result}"
+        return f"add {kind} {text}, {self.number(kind, 0)}"
