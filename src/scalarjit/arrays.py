@@ -68,7 +68,7 @@ def numbers_of(graph: Graph, scalars: Any) -> Any:
         if np.any(scalars >= 0):
             return None
         different, places = np.unique(scalars, return_inverse=True)
-        return np.array([int(value_of(scalar)) for scalar in different.tolist()])[places].reshape(scalars.shape)
+        return np.array([int(value_of(scalar)) for scalar in different.tolist()], int)[places].reshape(scalars.shape)
     return number_of(graph, graph.op(("convert", INDEX), int(scalars)))
 
 

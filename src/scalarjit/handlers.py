@@ -4,9 +4,10 @@ import ctypes
 
 import jax
 
+from scalarjit.compiler import loaded, object_code
 from scalarjit.emission import ALIGNMENT
 from scalarjit.function import Function
-from scalarjit.machine import compiled, engine_of
+from scalarjit.machine import compiled
 
 HANDLER = """
 declare ptr @malloc(i64)
@@ -148,7 +149,7 @@ class Handler:
             cell=made.cell.ctypes.data,
             body=body,
         )
-        self._engine = engine_of(text, 1 if members else 0, 1)
+        self._engine = loaded(object_code(text, 1 if members else 0))
         self._called = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(self._engine.get_function_address("handler"))
         self.capsule = jax.ffi.pycapsule(self._called)
 

@@ -2,22 +2,18 @@
 
 import atexit
 import threading
-import time
 import weakref
 from typing import Any
 
 import numpy as np
-from llvmlite import binding as llvm
 
+from scalarjit.compiler import Beside, loaded, object_code
 from scalarjit.emission import CALLEES, Code, emitted
 from scalarjit.function import Function
 
 OFTEN = 2000  # calls after which a function is compiled with care, and passes of loops in it
 PAUSE = 0.02  # between two looks at how often functions have been called [s]
-# LLVM compiles one function at a time. A program is compiled function by function: while it is, none is compiled again.
-QUIET = 0.3  # since a function has been compiled at once [s]
 CARE = 2  # level of optimisation then
-MOST_CARE = 2_000_000  # characters of a function up to which it is compiled again: it takes a second
 
 _lock = threading.RLock()
 
@@ -39,73 +35,35 @@ class Compiled:
         self.cell = np.zeros(CALLEES + len(self.callees), np.int64)
         self.cell[CALLEES:] = [each.cell.ctypes.data for each in self.callees]
         self.engines: list[Any] = []
-        self.level = -1
 
-    def load(self, level: int) -> None:
-        """Compile the function and have it called from now on."""
-        engine = engine_of(self.code.text, level, self.lanes)
-        with _lock:
-            self.engines.append(engine)
-            self.level = level
-            self.cell[0] = engine.get_function_address(self.symbol)
+    def load(self, code: bytes) -> None:
+        """Have code called from now on."""
+        engine = loaded(code)
+        self.engines.append(engine)
+        self.cell[0] = engine.get_function_address(self.symbol)
 
 
-_last_compiled = 0.0  # on the clock of `time.monotonic`
 _compiled: "weakref.WeakKeyDictionary[Function, dict[int, Compiled]]" = weakref.WeakKeyDictionary()
 
 
 def compiled(function: Function, lanes: int) -> Compiled:
     """Give a function that is ready to be called."""
-    global _last_compiled
     with _lock:
         versions = _compiled.setdefault(function, {})
         if lanes not in versions:
             made = Compiled(function, lanes)
-            made.load(0)
-            _last_compiled = time.monotonic()
+            made.load(object_code(made.code.text, 0))
             versions[lanes] = made
             _watch(made)
         return versions[lanes]
 
 
-def _target(level: int) -> llvm.TargetMachine:
-    _initialise()
-    features = llvm.get_host_cpu_features().flatten()
-    return llvm.Target.from_default_triple().create_target_machine(
-        opt=level, jit=True, cpu=llvm.get_host_cpu_name(), features=features
-    )
-
-
-_is_initialised = False
-
-
-def _initialise() -> None:
-    global _is_initialised
-    if not _is_initialised:
-        llvm.initialize_native_target()
-        llvm.initialize_native_asmprinter()
-        _is_initialised = True
-
-
-def engine_of(text: str, level: int, lanes: int) -> Any:
-    _initialise()
-    module = llvm.parse_assembly(text)
-    machine = _target(level)
-    if level:
-        tuning = llvm.create_pipeline_tuning_options(speed_level=level)
-        tuning.slp_vectorization = False
-        builder = llvm.create_pass_builder(machine, tuning)
-        builder.getModulePassManager().run(module, builder)
-    engine = llvm.create_mcjit_compiler(module, machine)
-    engine.finalize_object()
-    return engine
-
-
-# A thread that compiles again what runs often.
+# A thread that has compiled again what runs often.
 
 _watched: "weakref.WeakSet[Compiled]" = weakref.WeakSet()
 _stop = threading.Event()
 _thread: threading.Thread | None = None
+_beside: Beside | None = None
 
 
 def _watch(made: Compiled) -> None:
@@ -118,18 +76,22 @@ def _watch(made: Compiled) -> None:
 
 
 def _end() -> None:
-    """LLVM's own memory goes as the process ends: nothing may be compiled then."""
     _stop.set()
-    if _thread is not None:
-        _thread.join()
+    if _beside is not None:
+        _beside.end()
 
 
 def _improve() -> None:
+    global _beside
     while not _stop.wait(PAUSE):
         for made in list(_watched):
-            if _stop.is_set() or time.monotonic() < _last_compiled + QUIET:
-                break
-            if made.cell[1] > OFTEN:
-                _watched.discard(made)
-                if len(made.code.text) <= MOST_CARE:
-                    made.load(CARE)
+            if made.cell[1] <= OFTEN or _stop.is_set():
+                continue
+            _watched.discard(made)
+            try:
+                _beside = _beside or Beside(CARE)
+                code = _beside.object_code(made.code.text)
+            except (OSError, EOFError):  # no process may be started here, or it has ended
+                return
+            if not _stop.is_set():
+                made.load(code)

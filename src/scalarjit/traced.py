@@ -43,6 +43,21 @@ def closed_of(jaxpr: Jaxpr) -> ClosedJaxpr:
     return _closed[id(jaxpr)]
 
 
+_ordered: dict[Any, tuple[Any, ClosedJaxpr]] = {}
+
+
+def in_order(closed: ClosedJaxpr, order: tuple[int, ...]) -> ClosedJaxpr:
+    """The same function of its arguments in another order."""
+    key = id(closed), order
+    if key not in _ordered:
+        jaxpr = closed.jaxpr
+        inner = jaxpr.replace(
+            invars=[jaxpr.invars[number] for number in order], debug_info=jaxpr.debug_info.with_unknown_names()
+        )
+        _ordered[key] = closed, ClosedJaxpr(inner, closed.consts)
+    return _ordered[key][1]
+
+
 _implementations: dict[Any, ClosedJaxpr] = {}
 
 

@@ -17,7 +17,7 @@ from scalarjit.arrays import NONE
 from scalarjit.function import Function
 from scalarjit.functions import FUNCTIONS, function_of
 from scalarjit.graph import constants, value_of
-from scalarjit.rules.rule import Unsupported
+from scalarjit.parts import in_parts, is_compilable
 
 try:
     from scalarjit.handlers import Handler
@@ -63,6 +63,8 @@ def scalarised(function: Callable[..., Any], known: Callable[..., Any] = lambda 
     @wraps(function)
     def compute(*args: Any) -> Any:
         trace = traced.trace(*args)
+        if trace.jaxpr.effects:  # what is printed, or called back for more than its results
+            return traced(*args)
         found = _bind(map(jnp.asarray, jax.tree.leaves(args)), trace.jaxpr, _Known.of(known(*args)))
         return jax.tree.unflatten(jax.tree.structure(trace.out_info), found)
 
@@ -132,24 +134,16 @@ _names = itertools.count()
 _kept: list[Any] = []  # handlers, which JAX's programs may call as long as the process lives
 
 
-def _say(text: str) -> None:
-    warnings.warn(f"scalarjit: {text}", RuntimeWarning, stacklevel=2)
-
-
 @_once
-def _function(jaxpr: ClosedJaxpr, known: tuple[_Known | None, ...]) -> Function | None:
-    """What LLVM compiles; None where it cannot compute it."""
-    if Handler is None:
-        return None
-    of_args = [
-        None if each is None else each.constants(aval.shape, np.dtype(aval.dtype))
-        for each, aval in itertools.zip_longest(known, jaxpr.in_avals)
-    ]
-    try:
-        return function_of(jaxpr, of_args)
-    except Unsupported as error:
-        _say(f"a function is left to XLA: {error}")
-        return None
+def _function(jaxpr: ClosedJaxpr, known: tuple[_Known | None, ...]) -> Function:
+    """What LLVM compiles."""
+    return function_of(
+        jaxpr,
+        [
+            None if each is None else each.constants(aval.shape, np.dtype(aval.dtype))
+            for each, aval in itertools.zip_longest(known, jaxpr.in_avals)
+        ],
+    )
 
 
 @_once
@@ -157,7 +151,6 @@ def _handler(jaxpr: ClosedJaxpr, known: tuple[_Known | None, ...], batch: Batch 
     """The name by which JAX calls the function of a jaxpr."""
     function = _function(jaxpr, known)
     assert Handler is not None
-    assert function is not None
     members, batched = batch or (None, ())
     handler = Handler(function, 1 if batch is None else LANES, members, batched)
     _kept.append(handler)
@@ -168,9 +161,12 @@ def _handler(jaxpr: ClosedJaxpr, known: tuple[_Known | None, ...], batch: Batch 
 
 def _called(*args, jaxpr, known, derivative, batch):
     """A call of compiled code among XLA's operations."""
-    function = _function(jaxpr, known)
-    if function is None:
+    if Handler is None:
         return _as_it_stands(*args, jaxpr=jaxpr, known=known, derivative=derivative, batch=batch)
+    if not is_compilable(jaxpr.jaxpr):
+        compile = lambda part, known: lambda *args: _bind(args, part, known)
+        return _of_members(in_parts(jaxpr, known, compile), args, batch)
+    function = _function(jaxpr, known)
     lead = _lead(batch)
     written = [
         jax.ShapeDtypeStruct((*lead, *result.shape), result.dtype) for result in function.results if result.is_written
@@ -192,7 +188,10 @@ def _values(result):
 
 
 def _as_it_stands(*args, jaxpr, known, derivative, batch):
-    compute = jaxpr_as_fun(jaxpr)
+    return _of_members(jaxpr_as_fun(jaxpr), args, batch)
+
+
+def _of_members(compute, args, batch):
     if batch is None:
         return compute(*args)
     axes = [0 if is_batched else None for is_batched in batch.batched]

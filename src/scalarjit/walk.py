@@ -31,7 +31,7 @@ from scalarjit.graph import (
 from scalarjit.operations import is_supported
 from scalarjit.rules import RULES
 from scalarjit.rules.rule import SMALL, Unsupported
-from scalarjit.traced import by_implementation, called_by, check, num_equations, stays_as_it_is, uses_of
+from scalarjit.traced import by_implementation, called_by, check, in_order, num_equations, stays_as_it_is, uses_of
 
 FEW = 8  # equations of a function that is always computed in place
 MOST_PASSES = 64  # of a scan that is written pass by pass
@@ -182,14 +182,29 @@ class Walk:
         init = inputs[cond_nconsts + body_nconsts :]
         stays = stays_as_it_is(body_jaxpr.jaxpr, body_nconsts, range(len(init)))
 
+        def condition(carry):
+            (going,) = self.closed(cond_jaxpr, [*of_test, *carry])
+            return going
+
         def body(carry):
-            return self.closed(body_jaxpr, [*of_body, *carry])
+            found = self.closed(body_jaxpr, [*of_body, *carry])
+            if not cond_jaxpr.out_avals[0].shape:
+                return found
+            # Of a batch of loops, each goes on by itself: what has ended stays.
+            going = condition(carry)
+            return [
+                after if after is before else _where(going, after, before)
+                for before, after in zip(carry, found, strict=True)
+            ]
 
         carried = Carried(graph, init, stays)
         region = carried.settle(body)
         with graph.inside() as test:
-            (goes_on,) = self.closed(cond_jaxpr, [*of_test, *carried.arrays()])
-            goes_on = goes_on.at(())
+            going = condition(carried.arrays())
+            if going.shape:
+                any_of = jax.ShapeDtypeStruct((), BOOL)
+                going = RULES["reduce_or"](graph, "reduce_or", any_of, [going], axes=tuple(range(len(going.shape))))
+            goes_on = going.at(())
         graph.do(While(test, goes_on, region))
         return carried.arrays()
 
@@ -239,6 +254,20 @@ class Walk:
         found = [Stored(graph, (length, *out.aval.shape), buffer) for out, buffer in zip(outs, buffers, strict=True)]
         return [*carried.arrays(), *found]
 
+    def members(self, inputs: list[Array], *, jaxpr: ClosedJaxpr, batch: Any, **params: Any) -> list[Array]:
+        """A function that is compiled by itself elsewhere, of one member or of all of a batch, one after another."""
+        if batch is None:
+            return self.call(jaxpr, inputs)
+        order = sorted(range(len(inputs)), key=batch.batched.__getitem__)
+        return self.scan(
+            [inputs[number] for number in order],
+            jaxpr=in_order(jaxpr, tuple(order)),
+            length=batch.members,
+            reverse=False,
+            num_consts=batch.batched.count(False),
+            num_carry=0,
+        )
+
 
 def _agreed(arrays):
     """Constants that all branches return, and `NONE` in other places; None where there are no such arrays."""
@@ -247,6 +276,12 @@ def _agreed(arrays):
         return None
     same = np.all([each == first for each in [first, *others]], axis=0) & (first < 0)
     return np.where(same, first, NONE)
+
+
+def _where(condition: Array, yes: Array, no: Array) -> Array:
+    """One of two arrays, by a condition of their first axes."""
+    aligned = _reshaped(condition, (*condition.shape, *[1] * (len(yes.shape) - len(condition.shape))))
+    return RULES["select_n"](yes.graph, "select_n", jax.ShapeDtypeStruct(yes.shape, yes.dtype), [aligned, no, yes])
 
 
 def _row(array: Array, place: Any) -> Array:
@@ -285,4 +320,4 @@ def _all_constant(array):
     return isinstance(array, Entries) and bool(np.all(array.ids < 0))
 
 
-CONTROL = {"cond": Walk.cond, "while": Walk.while_, "scan": Walk.scan}
+CONTROL = {"cond": Walk.cond, "while": Walk.while_, "scan": Walk.scan, "scalarised": Walk.members}

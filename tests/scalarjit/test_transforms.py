@@ -76,6 +76,15 @@ def test_within_programs_of_jax():
     np.testing.assert_allclose(inside(scalarised(few)), inside(few), rtol=1e-12)
 
 
+def test_within_each_other():
+    """A function compiled by itself is part of another one, for one member and for many."""
+    xs, y = jnp.asarray(numbers(20, 4, 4)), jnp.asarray(numbers(4, 4, seed=1))
+    inner = lambda function: lambda xs, y: (function(xs[0], y), jax.vmap(function, (0, None))(xs, y))
+    found, expected = scalarised(inner(scalarised(few)))(xs, y), inner(few)(xs, y)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
 def test_known_entries_are_taken_for_granted():
     """They need not be the ones that are passed."""
     known = np.array([[2.0, np.nan], [np.nan, 0.0]])

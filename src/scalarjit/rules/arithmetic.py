@@ -84,10 +84,10 @@ def _few_remain(shape, arrays):
 
     An operation with a zero or one is none, or is one operand's; where all operands are read, equal ones are one.
     """
-    read = [array for array in arrays if has_entries(array)]
-    if len(read) == len(arrays):
+    if all(map(has_entries, arrays)):
         return True
-    counts = [np.count_nonzero(np.broadcast_to(_is_simple(known_of(array)), shape)) for array in read if array.size > 1]
+    known = [ids for array in arrays if array.size > 1 and (ids := known_of(array)) is not None]
+    counts = [np.count_nonzero(np.broadcast_to(_is_simple(ids), shape)) for ids in known if ids.size <= MANY]
     return math.prod(shape) - max(counts, default=0) <= UNROLLED
 
 
@@ -95,7 +95,7 @@ def _is_simple(ids):
     """Whether scalars are zeros or ones."""
     different, places = np.unique(ids, return_inverse=True)
     simple = [is_zero(scalar) or is_one(scalar) for scalar in different.tolist()]
-    return np.array(simple)[places].reshape(ids.shape)
+    return np.array(simple, bool)[places].reshape(ids.shape)
 
 
 def _different(columns) -> int:

@@ -1,0 +1,78 @@
+"""Code that LLVM makes: again with more care, with the same bits, in memory that holds anything at first, in parts."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from agreement import agrees, numbers
+from jax import lax
+from test_control import FUNCTIONS
+
+from scalarjit import handlers, scalarised
+from scalarjit.machine import CARE, Compiled
+
+PATIENCE = 60.0  # seconds, where others work too
+
+
+def test_what_runs_often_is_compiled_again_to_the_same_bits(monkeypatch):
+    loaded = []
+
+    def load(self, code, load=Compiled.load):
+        load(self, code)
+        loaded.append(self)
+
+    monkeypatch.setattr(Compiled, "load", load)
+    function = scalarised(lambda x: lax.fori_loop(0, 100, lambda k, x: jnp.cos(x @ x.T / 3) + k / 7, x))
+    x = numbers(3, 3)
+    first = np.asarray(function(x))
+    times = len(loaded)
+    end = time.monotonic() + PATIENCE
+    again = lambda: [made for made in loaded[times:] if made in loaded[:times]]
+    while not again() and time.monotonic() < end:
+        found = function(x)
+    assert again(), f"none of level {CARE}"
+    np.testing.assert_array_equal(function(x), first)
+    np.testing.assert_array_equal(found, first)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_memory_may_hold_anything_at_first(function, monkeypatch):
+    """No number, that is: what is read before it is written spoils results."""
+    fill = "call void @llvm.memset.p0.i64(ptr %raw, i8 -1, i64 {bytes}, i1 false)\n%number = ptrtoint"
+    handler = handlers.HANDLER.replace("%number = ptrtoint", fill)
+    monkeypatch.setattr(handlers, "HANDLER", "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)\n" + handler)
+    for shape in (3,), (20, 10):
+        agrees(lambda x, y: function(x, y), numbers(*shape), numbers(*shape, seed=1), rtol=1e-11)
+
+
+def in_parts(x):
+    """Eigenvalues, which XLA computes, by themselves, in loops and in branches."""
+    symmetric = jnp.sin(x @ x.T)
+    values, vectors = jnp.linalg.eigh(symmetric)
+    turned = lambda k, x: jnp.cos(jnp.abs(jnp.linalg.eigh(x)[1]) @ x @ x.T / 9) + k
+    looped = lax.fori_loop(0, 3, turned, symmetric)
+    going = lambda carry: jnp.linalg.eigvalsh(carry)[0] > -1.0
+    halved = lax.while_loop(going, lambda carry: carry - 0.3 * jnp.eye(4), symmetric)
+    chosen = lax.cond(jnp.sum(x) > 0, lambda: jnp.linalg.eigvalsh(looped + looped.T), lambda: values)
+    scanned = lax.scan(lambda carry, row: (carry + jnp.linalg.eigvalsh(jnp.outer(row, row)), row * 2), values, x)
+    return values, jnp.abs(vectors) * 2, looped, halved, chosen, scanned, jnp.abs(jnp.linalg.eigvals(x)).sum()
+
+
+def test_what_has_no_rule_is_left_to_xla_and_the_rest_is_not():
+    x = numbers(4, 4)
+    agrees(in_parts, x)
+    agrees(jax.vmap(in_parts), np.stack([x, 2 * x, -x]))
+    loss = lambda function: lambda x: jnp.sum(function(x)[0] ** 2) + jnp.sum(function(x)[2])
+    slopes = jax.jacfwd(loss(scalarised(in_parts)))(x)
+    # Up to 50, and eigenvectors turn by much where eigenvalues are close.
+    np.testing.assert_allclose(slopes, jax.jacfwd(loss(in_parts))(x), atol=1e-8)
+
+
+def test_callbacks_are_left_to_xla():
+    told = []
+    agrees(lambda x: jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((3,), float), x * 3) + x, numbers(3))
+    scalarised(lambda x: jax.debug.callback(told.append, x.sum()) or x * 2)(numbers(3))
+    jax.effects_barrier()
+    np.testing.assert_allclose(told, np.sum(numbers(3)))
