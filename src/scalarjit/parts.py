@@ -10,7 +10,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
 from scalarjit.factorisations import FACTORISATIONS
 from scalarjit.rules import RULES
 from scalarjit.rules.rule import Unsupported
-from scalarjit.traced import by_implementation, called_by, check, inner_of
+from scalarjit.traced import by_implementation, called_by, check, inner_of, lengths_of_scan
 
 LOOPS_AND_BRANCHES = ("cond", "while", "scan")
 
@@ -120,8 +120,8 @@ def _by_xla(equation, known, args, compile):
 
         return lax.while_loop(lambda carry: jnp.any(going(carry)), turn, args[more:])
     if name == "scan":
-        count = params["num_consts"]
-        more = count + params["num_carry"]
+        count, num_carry = lengths_of_scan(params)
+        more = count + num_carry
         body = in_parts(params["jaxpr"], known[:count], compile)
 
         def step(carry, rows):

@@ -22,6 +22,14 @@ def stays_as_it_is(jaxpr, num_consts, numbers):
     return [jaxpr.outvars[number] is jaxpr.invars[num_consts + number] for number in numbers]
 
 
+def lengths_of_scan(params: dict[str, Any]) -> tuple[int, int]:
+    """How many constants and how many carried arrays a scan has; JAX 0.12 says so in another way."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    parts = [0 if part is None else len(part) for part in params["ft_in"].unpack()]
+    return parts[0], parts[1]
+
+
 def called_by(name: str, params: dict[str, Any]) -> ClosedJaxpr | None:
     """The function that an equation calls, if it does."""
     for key in ("call_jaxpr", "fun_jaxpr", "jaxpr"):

@@ -31,7 +31,16 @@ from scalarjit.graph import (
 from scalarjit.operations import is_supported
 from scalarjit.rules import RULES
 from scalarjit.rules.rule import SMALL, Unsupported
-from scalarjit.traced import by_implementation, called_by, check, in_order, num_equations, stays_as_it_is, uses_of
+from scalarjit.traced import (
+    by_implementation,
+    called_by,
+    check,
+    in_order,
+    lengths_of_scan,
+    num_equations,
+    stays_as_it_is,
+    uses_of,
+)
 
 FEW = 8  # equations of a function that is always computed in place
 MOST_PASSES = 64  # of a scan that is written pass by pass
@@ -208,16 +217,17 @@ class Walk:
         graph.do(While(test, goes_on, region))
         return carried.arrays()
 
-    def scan(
+    def scan(self, inputs: list[Array], **params: Any) -> list[Array]:
+        return self._scan(inputs, params["jaxpr"], params["length"], params["reverse"], *lengths_of_scan(params))
+
+    def _scan(
         self,
         inputs: list[Array],
-        *,
         jaxpr: ClosedJaxpr,
         length: int,
         reverse: bool,
         num_consts: int,
         num_carry: int,
-        **params: Any,
     ) -> list[Array]:
         graph = self.graph
         consts, init = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
@@ -259,13 +269,9 @@ class Walk:
         if batch is None:
             return self.call(jaxpr, inputs)
         order = sorted(range(len(inputs)), key=batch.batched.__getitem__)
-        return self.scan(
-            [inputs[number] for number in order],
-            jaxpr=in_order(jaxpr, tuple(order)),
-            length=batch.members,
-            reverse=False,
-            num_consts=batch.batched.count(False),
-            num_carry=0,
+        given = [inputs[number] for number in order]
+        return self._scan(
+            given, in_order(jaxpr, tuple(order)), batch.members, False, batch.batched.count(False), num_carry=0
         )
 
 

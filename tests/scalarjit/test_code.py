@@ -62,11 +62,11 @@ def in_parts(x):
 
 def test_what_has_no_rule_is_left_to_xla_and_the_rest_is_not():
     x = numbers(4, 4)
-    agrees(in_parts, x)
-    agrees(jax.vmap(in_parts), np.stack([x, 2 * x, -x]))
+    # Eigenvectors turn by much where eigenvalues are close.
+    agrees(in_parts, x, rtol=1e-9)
+    agrees(jax.vmap(in_parts), np.stack([x, 2 * x, -x]), rtol=1e-9)
     loss = lambda function: lambda x: jnp.sum(function(x)[0] ** 2) + jnp.sum(function(x)[2])
     slopes = jax.jacfwd(loss(scalarised(in_parts)))(x)
-    # Up to 50, and eigenvectors turn by much where eigenvalues are close.
     np.testing.assert_allclose(slopes, jax.jacfwd(loss(in_parts))(x), atol=1e-8)
 
 
