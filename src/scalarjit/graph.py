@@ -368,9 +368,6 @@ class Index:
     def __gt__(self, other):
         return self._with("gt", other)
 
-    def equals(self, other):
-        return self._with("eq", other)
-
     def __and__(self, other):
         return self._with("and", other)
 
