@@ -15,7 +15,6 @@ class Carried:
     def __init__(self, graph: Graph, init: list[Array], stays: list[bool]) -> None:
         self.graph = graph
         self.init = init
-        self.stays = stays
         self.buffers = [
             None if stay else Buffer(array.dtype, array.size) for array, stay in zip(init, stays, strict=True)
         ]

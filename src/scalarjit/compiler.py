@@ -60,7 +60,8 @@ class Beside:
 
         **Raises:** `OSError`, `EOFError` where the process has ended.
         """
-        to, from_ = self._process.stdin, self._process.stdout
+        to = self._process.stdin
+        from_ = self._process.stdout
         assert to is not None
         assert from_ is not None
         data = text.encode()

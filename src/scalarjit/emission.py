@@ -9,8 +9,8 @@ In vectors each entry of an array takes as many places in memory as a vector has
 in memory, and what follows from them alone, are the same for all members and stay scalars.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -185,7 +185,8 @@ class _Emission(Instructions):
         self.line(f"store {kind} {value}, ptr {address}, align {align}")
 
     def copied(self, copy: Copy) -> None:
-        source, target = copy.source, copy.target
+        source = copy.source
+        target = copy.target
         if source is target or not source.size:
             return
         if self.lanes > 1 and (source.kind == "constant" or (copy.blended and self.mask)):
@@ -193,16 +194,20 @@ class _Emission(Instructions):
             return
         size = source.size * np.dtype(memory_dtype(source)).itemsize * self.lanes
         self.declared.add("declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)")
-        to, from_ = self.address(target), self.address(source)
+        to = self.address(target)
+        from_ = self.address(source)
         self.line(f"call void @llvm.memcpy.p0.p0.i64(ptr {to}, ptr {from_}, i64 {size}, i1 false)")
 
     def copied_by_vectors(self, copy: Copy) -> None:
         of = memory_type(copy.source.dtype)
         vector = self.vector(of)
-        to, from_ = self.address(copy.target), self.address(copy.source)
+        to = self.address(copy.target)
+        from_ = self.address(copy.source)
         align = _alignment(copy.source)
 
-        def one(index: str) -> None:
+        index = f"%{self.label()}"
+
+        def one() -> None:
             if copy.source.kind == "constant":
                 address = self.value(f"getelementptr {of}, ptr {from_}, i64 {index}")
                 new = self.splat(self.value(f"load {of}, ptr {address}, align {align}"), of)
@@ -215,22 +220,30 @@ class _Emission(Instructions):
                 new = self.value(f"select {self.vector('i1')} {self.mask}, {vector} {new}, {vector} {old}")
             self.line(f"store {vector} {new}, ptr {target}, align {align}")
 
-        self.counted(copy.source.size, one)
+        self.counted(copy.source.size, index, one)
 
-    def counted(self, count: int, body: Any) -> None:
-        """A loop over 0, ..., count − 1 of lines."""
-        before, head, inner, after = self.block, self.label(), self.label(), self.label()
-        index = f"%{self.label()}"
-        following = f"{index}n"
+    def counted(
+        self, count: int, index: str, body: Callable[[], None], carried: Sequence[tuple[int, int, int]] = ()
+    ) -> None:
+        """A loop over 0, ..., count − 1. `carried`: as in `For`."""
+        head = self.label()
+        inner = self.label()
+        after = self.label()
+        firsts = [self.operand(first, uniform=self.lanes == 1) for _, first, _ in carried]
+        before = self.block
         self.begin(head)
         at = len(self.lines)
-        self.lines.append("")
+        self.lines.extend([""] * (1 + len(carried)))
         test = self.value(f"icmp slt i64 {index}, {count}")
         self.begin(inner, after=f"br i1 {test}, label %{inner}, label %{after}")
-        body(index)
-        self.line(f"{following} = add i64 {index}, 1")
+        body()
+        thens = [self.operand(then, uniform=self.lanes == 1) for _, _, then in carried]
+        self.line(f"{index}n = add i64 {index}, 1")
         last = self.block
-        self.lines[at] = f"{index} = phi i64 [0, %{before}], [{following}, %{last}]"
+        self.lines[at] = f"{index} = phi i64 [0, %{before}], [{index}n, %{last}]"
+        for number, ((scalar, _, _), first, then) in enumerate(zip(carried, firsts, thens, strict=True)):
+            kind = self.type(scalar)
+            self.lines[at + 1 + number] = f"%v{scalar} = phi {kind} [{first}, %{before}], [{then}, %{last}]"
         self.begin(after, after=f"br label %{head}")
 
     # Regions.
@@ -265,26 +278,9 @@ class _Emission(Instructions):
             self.operation(scalar)
 
     def for_(self, loop: For) -> None:
-        before, head, inner, after = self.block, self.label(), self.label(), self.label()
-        index = f"%v{loop.index}"
         self.uniform.add(loop.index)
-        carried = [(scalar, first, then) for scalar, first, then in loop.carried if scalar in self.used]
-        firsts = [self.operand(first, uniform=self.lanes == 1) for _, first, _ in carried]
-        before = self.block
-        self.begin(head)
-        at = len(self.lines)
-        self.lines.extend([""] * (1 + len(carried)))
-        test = self.value(f"icmp slt i64 {index}, {loop.count}")
-        self.begin(inner, after=f"br i1 {test}, label %{inner}, label %{after}")
-        self.region(loop.region)
-        thens = [self.operand(then, uniform=self.lanes == 1) for _, _, then in carried]
-        self.line(f"{index}n = add i64 {index}, 1")
-        last = self.block
-        self.lines[at] = f"{index} = phi i64 [0, %{before}], [{index}n, %{last}]"
-        for number, ((scalar, _, _), first, then) in enumerate(zip(carried, firsts, thens, strict=True)):
-            kind = self.type(scalar)
-            self.lines[at + 1 + number] = f"%v{scalar} = phi {kind} [{first}, %{before}], [{then}, %{last}]"
-        self.begin(after, after=f"br label %{head}")
+        carried = [each for each in loop.carried if each[0] in self.used]
+        self.counted(loop.count, f"%v{loop.index}", lambda: self.region(loop.region), carried)
         self.counts(loop.count)
 
     def counts(self, number: int) -> None:
@@ -293,7 +289,9 @@ class _Emission(Instructions):
         self.line(f"store i64 {self.value(f'add i64 {calls}, {number}')}, ptr %counter")
 
     def while_(self, loop: While) -> None:
-        head, inner, after = self.label(), self.label(), self.label()
+        head = self.label()
+        inner = self.label()
+        after = self.label()
         outer = self.mask
         self.begin(head)
         self.region(loop.test)
@@ -305,7 +303,8 @@ class _Emission(Instructions):
         self.mask = outer
 
     def if_(self, branch: If) -> None:
-        inner, after = self.label(), self.label()
+        inner = self.label()
+        after = self.label()
         outer = self.mask
         taken = self.taken(branch.condition)
         self.begin(inner, after=f"br i1 {taken}, label %{inner}, label %{after}")

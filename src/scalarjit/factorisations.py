@@ -36,7 +36,8 @@ def cholesky(matrix, **_params):
 def triangular_solve(matrix, right, *, left_side, lower, transpose_a, conjugate_a, unit_diagonal):
     """X of op(A) X = B, or of X op(A) = B."""
     if not left_side:
-        matrix, right = matrix.T, right.T
+        matrix = matrix.T
+        right = right.T
         lower = not lower
     if transpose_a:
         matrix = matrix.T
@@ -54,6 +55,10 @@ def triangular_solve(matrix, right, *, left_side, lower, transpose_a, conjugate_
     return (solved if left_side else solved.T,)
 
 
+def _exchanged(array, one, other):
+    return array.at[one].set(array[other]).at[other].set(array[one])
+
+
 def lu(matrix, **_params):
     """L and U of P A = L U in one matrix, pivots, the largest of their columns, and the permutation of rows."""
     rows, columns = matrix.shape
@@ -64,10 +69,8 @@ def lu(matrix, **_params):
         sizes = jnp.where(places >= number, jnp.abs(matrix[:, number]), -1.0)
         pivot = jnp.argmax(sizes).astype(pivots.dtype)
         pivots = pivots.at[number].set(pivot)
-        one, other = matrix[number], matrix[pivot]
-        matrix = matrix.at[number].set(other).at[pivot].set(one)
-        first, second = order[number], order[pivot]
-        order = order.at[number].set(second).at[pivot].set(first)
+        matrix = _exchanged(matrix, number, pivot)
+        order = _exchanged(order, number, pivot)
         below = places > number
         at = matrix[number, number]
         factors = jnp.where(below & (at != 0.0), matrix[:, number] / at, matrix[:, number])
@@ -83,9 +86,7 @@ def lu_pivots_to_permutation(pivots, *, permutation_size):
     """The permutation that exchanges of rows make."""
 
     def exchange(number, order):
-        pivot = pivots[number]
-        first, second = order[number], order[pivot]
-        return order.at[number].set(second).at[pivot].set(first)
+        return _exchanged(order, number, pivots[number])
 
     return (_each_row(len(pivots), exchange, jnp.arange(permutation_size, dtype=jnp.int32)),)
 

@@ -25,13 +25,11 @@ class Result:
 class Function:
     """A function of LLVM: its graph, and what its arguments and results are."""
 
-    name: str
     graph: Graph
     known: list[np.ndarray | None]  # constants of the arguments
     arguments: list[Buffer | None] = field(default_factory=list)  # None where all is constant
     results: list[Result] = field(default_factory=list)
     buffers: list[Buffer] = field(default_factory=list)  # of the results that are written
-    num_equations: int = 0
 
     @property
     def passed(self) -> list[Buffer]:

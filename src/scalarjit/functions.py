@@ -39,9 +39,6 @@ class Functions:
         versions.append(made)
         return made
 
-    def clear(self) -> None:
-        self._versions.clear()
-
 
 FUNCTIONS = Functions()
 
@@ -63,10 +60,10 @@ def _common(own, given):
     return total
 
 
-def function_of(closed: ClosedJaxpr, known: Iterable[np.ndarray | None], name: str = "function") -> Function:
+def function_of(closed: ClosedJaxpr, known: Iterable[np.ndarray | None]) -> Function:
     """Walk through a traced function into a graph of its own."""
     graph = Graph()
-    function = Function(name, graph, list(known))
+    function = Function(graph, list(known))
     inputs: list[Array] = []
     for number, (var, constants_) in enumerate(zip(closed.jaxpr.invars, function.known, strict=True)):
         check(var.aval)
@@ -89,7 +86,8 @@ def function_of(closed: ClosedJaxpr, known: Iterable[np.ndarray | None], name: s
         if result.is_written:
             if isinstance(array, Stored) and array.buffer.kind == "own" and id(array.buffer) not in written:
                 buffer = array.buffer
-                buffer.kind, buffer.number = "result", number
+                buffer.kind = "result"
+                buffer.number = number
                 written.add(id(buffer))
             else:
                 buffer = Buffer(array.dtype, array.size, "result", number)

@@ -136,7 +136,8 @@ class Handler:
         wanted = [f"ptr %r{number}" for number in range(len(function.buffers))]
         if members is None:
             body = f"call void %code({', '.join([*given, *wanted, 'ptr %memory', 'ptr %cell'])})"
-            packing, more = "", 0
+            packing = ""
+            more = 0
         else:
             body, packing, more = _over_groups(function, lanes, members, batched, passed, made.memory)
         text = HANDLER.format(
@@ -165,7 +166,8 @@ def _over_groups(function, lanes, members, batched, passed, memory):
         "group:",
     ]
     offset = memory
-    given, after = [], []
+    given = []
+    after = []
     sizes = set()
 
     def room(buffer, name):

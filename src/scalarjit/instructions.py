@@ -33,7 +33,7 @@ class Instructions(Writer):
         elif how[0] == "@":
             self.line(f"{own} = {self.intrinsic(how[1:], kind, texts)}")
         elif how[0] == "!":
-            self.library(own, how[1:], kind, dtype, texts)
+            self.of_c(own, how[1:], kind, dtype, texts)
         elif name in ("div", "rem") and dtype.kind != "f":
             self.whole_division(own, name, how, kind, operands, texts)
         else:
@@ -45,7 +45,7 @@ class Instructions(Writer):
         self.declared.add(f"declare {kind} @llvm.{name}.{of}({', '.join([kind] * len(texts))})")
         return f"call {kind} @llvm.{name}.{of}({given})"
 
-    def library(self, own: str, name: str, kind: str, dtype: np.dtype, texts: list[str]) -> None:
+    def of_c(self, own: str, name: str, kind: str, dtype: np.dtype, texts: list[str]) -> None:
         """A function of C, of each member."""
         self.declared.add(f"declare double @{name}({', '.join(['double'] * len(texts))})")
         single = dtype.itemsize == 4

@@ -26,8 +26,7 @@ class Compiled:
     """
 
     def __init__(self, function: Function, lanes: int) -> None:
-        self.function = function
-        self.lanes = lanes
+        # Not the function itself: what is compiled goes with it.
         self.symbol = "scalars"
         self.code: Code = emitted(function, lanes, self.symbol)
         self.callees = [compiled(each, lanes) for each in self.code.callees]

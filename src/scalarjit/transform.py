@@ -15,7 +15,7 @@ from jax.interpreters import ad, batching, mlir
 
 from scalarjit.arrays import NONE
 from scalarjit.function import Function
-from scalarjit.functions import FUNCTIONS, function_of
+from scalarjit.functions import function_of
 from scalarjit.graph import constants, value_of
 from scalarjit.parts import in_parts, is_compilable
 
@@ -91,9 +91,6 @@ class _Known:
         return np.where(np.isnan(values), NONE, constants(values.astype(dtype)))
 
 
-FORGET: list[Callable[[], None]] = [FUNCTIONS.clear]  # what lets go of what was traced and compiled
-
-
 def _once(function):
     """Keep what a function made of a jaxpr, and of what else it takes."""
     made: dict[Any, Any] = {}
@@ -105,7 +102,6 @@ def _once(function):
             made[key] = jaxpr, function(jaxpr, *more)
         return made[key][1]
 
-    FORGET.append(made.clear)
     return find
 
 
