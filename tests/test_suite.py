@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,12 @@ def test_what_did_not_run_is_told(tmp_path):
     parts = [ran(tmp_path, "--share", f"{k}/2") for k in range(2)]
     left = [int(part.partition("test_them.py: ")[2].split()[0]) for part in parts if "did not run" in part]
     assert sum(left) == 3
+
+
+def test_modules_of_tests_have_names_of_their_own():
+    """pytest imports each module of tests by its file's name alone, wherever it lies."""
+    names = Counter(path.name for path in TESTS.rglob("*.py"))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def touched(*changed):
