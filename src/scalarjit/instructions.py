@@ -36,6 +36,8 @@ class Instructions(Writer):
             self.of_c(own, how[1:], kind, dtype, texts)
         elif name in ("div", "rem") and dtype.kind != "f":
             self.whole_division(own, name, how, kind, operands, texts)
+        elif name.startswith("shift"):
+            self.shifted(own, how, kind, dtype, operands, texts)
         else:
             self.line(f"{own} = {how} {kind} {', '.join(texts)}")
 
@@ -46,15 +48,18 @@ class Instructions(Writer):
         return f"call {kind} @llvm.{name}.{of}({given})"
 
     def of_c(self, own: str, name: str, kind: str, dtype: np.dtype, texts: list[str]) -> None:
-        """A function of C, of each member."""
-        self.declared.add(f"declare double @{name}({', '.join(['double'] * len(texts))})")
+        """A function of C, of each member; in double precision, but for what that would round away."""
         single = dtype.itemsize == 4
+        in_double = not (single and name == "nextafter")
+        real = "double" if in_double else "float"
+        name = name if in_double else f"{name}f"
+        self.declared.add(f"declare {real} @{name}({', '.join([real] * len(texts))})")
 
         def one(texts: list[str]) -> str:
-            if single:
+            if single and in_double:
                 texts = [self.value(f"fpext float {text} to double") for text in texts]
-            found = self.value(f"call double @{name}({', '.join(f'double {text}' for text in texts)})")
-            return self.value(f"fptrunc double {found} to float") if single else found
+            found = self.value(f"call {real} @{name}({', '.join(f'{real} {text}' for text in texts)})")
+            return self.value(f"fptrunc double {found} to float") if single and in_double else found
 
         if not kind.startswith("<"):
             of = llvm_type(dtype)
@@ -71,17 +76,40 @@ class Instructions(Writer):
                 vector = self.value(f"insertelement {kind} {vector}, {of} {found}, i64 {lane}")
 
     def whole_division(self, own, name, how, kind, operands, texts) -> None:
-        """As JAX has it, x / 0 = −1 and x % 0 = x; processors stop."""
-        if operands[1] < 0 and value_of(operands[1]) != 0:
+        """As JAX has it, x / 0 = −1, x % 0 = x, and x / −1 = −x of the least x, too; processors stop."""
+        signed = how[0] == "s"
+        if operands[1] < 0 and value_of(operands[1]) not in ((0, -1) if signed else (0,)):
             self.line(f"{own} = {how} {kind} {', '.join(texts)}")
             return
-        none, one, all_bits = self.number(kind, 0), self.number(kind, 1), self.number(kind, -1)
-        test = self.value(f"icmp eq {kind} {texts[1]}, {none}")
+        none = self.number(kind, 0)
+        one = self.number(kind, 1)
+        all_bits = self.number(kind, -1)
         bools = self.vector("i1") if kind.startswith("<") else "i1"
-        safe = self.value(f"select {bools} {test}, {kind} {one}, {kind} {texts[1]}")
+        by_none = self.value(f"icmp eq {kind} {texts[1]}, {none}")
+        safe = self.value(f"select {bools} {by_none}, {kind} {one}, {kind} {texts[1]}")
+        if signed:
+            by_minus_one = self.value(f"icmp eq {kind} {texts[1]}, {all_bits}")
+            safe = self.value(f"select {bools} {by_minus_one}, {kind} {one}, {kind} {safe}")
         found = self.value(f"{how} {kind} {texts[0]}, {safe}")
+        if signed and name == "div":
+            minus = self.value(f"sub {kind} {none}, {texts[0]}")
+            found = self.value(f"select {bools} {by_minus_one}, {kind} {minus}, {kind} {found}")
         other = all_bits if name == "div" else texts[0]
-        self.line(f"{own} = select {bools} {test}, {kind} {other}, {kind} {found}")
+        self.line(f"{own} = select {bools} {by_none}, {kind} {other}, {kind} {found}")
+
+    def shifted(self, own, how, kind, dtype, operands, texts) -> None:
+        """As JAX has it, by as many places as there are, or more, nothing is left but the sign; LLVM leaves it open."""
+        bits = 8 * dtype.itemsize
+        if operands[1] < 0 and 0 <= int(value_of(operands[1])) < bits:
+            self.line(f"{own} = {how} {kind} {', '.join(texts)}")
+            return
+        bools = self.vector("i1") if kind.startswith("<") else "i1"
+        none = self.number(kind, 0)
+        within = self.value(f"icmp ult {kind} {texts[1]}, {self.number(kind, bits)}")
+        places = self.value(f"select {bools} {within}, {kind} {texts[1]}, {kind} {none}")
+        found = self.value(f"{how} {kind} {texts[0]}, {places}")
+        sign = self.value(f"ashr {kind} {texts[0]}, {self.number(kind, bits - 1)}") if how == "ashr" else none
+        self.line(f"{own} = select {bools} {within}, {kind} {found}, {kind} {sign}")
 
     @staticmethod
     def number(kind: str, value: int) -> str:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,14 +36,27 @@ def _test(compute, real, signed, unsigned):
     return Operation(compute, f"fcmp {real}", f"icmp {signed}", f"icmp {unsigned}", True)
 
 
-def _shifted_right(one, other):
-    return (one.view(f"u{one.itemsize}") >> other).view(one.dtype)
+def _shifted_right(kind, one, other):
+    """As a number with a sign, of kind "i", or without one, "u"."""
+    of_kind = f"{kind}{one.itemsize}"
+    return (one.view(of_kind) >> other.view(of_kind)).view(one.dtype)
 
 
 def _quotient(one, other):
-    if np.dtype(one.dtype).kind == "f":
+    if one.dtype.kind == "f":
         return one / other
-    return np.trunc(one / other).astype(one.dtype) if other != 0 else np.full_like(one, -1)
+    if other == 0:
+        return np.invert(np.zeros_like(one))
+    size = abs(int(one)) // abs(int(other))  # exact, where a quotient of reals rounds
+    quotient = size if (one < 0) == (other < 0) else -size
+    return one if quotient > np.iinfo(one.dtype).max else one.dtype.type(quotient)  # −2⁶³ / −1 = −2⁶³
+
+
+def _log_gamma(number):
+    try:
+        return math.lgamma(number)
+    except (ValueError, OverflowError):  # at a pole, and beyond the largest number
+        return math.inf
 
 
 def _remainder(one, other):
@@ -59,8 +73,8 @@ OPERATIONS = {
     "or": _of_kinds(np.bitwise_or, None, "or"),
     "xor": _of_kinds(np.bitwise_xor, None, "xor"),
     "shift_left": _of_kinds(np.left_shift, None, "shl"),
-    "shift_right_arithmetic": _of_kinds(np.right_shift, None, "ashr"),
-    "shift_right_logical": _of_kinds(_shifted_right, None, "lshr"),
+    "shift_right_arithmetic": _of_kinds(partial(_shifted_right, "i"), None, "ashr"),
+    "shift_right_logical": _of_kinds(partial(_shifted_right, "u"), None, "lshr"),
     "eq": _test(np.equal, "oeq", "eq", "eq"),
     "ne": _test(np.not_equal, "une", "ne", "ne"),
     "lt": _test(np.less, "olt", "slt", "ult"),
@@ -95,7 +109,7 @@ OPERATIONS = {
     "pow": _of_kinds(np.power, "!pow"),
     "erf": _of_kinds(math.erf, "!erf"),
     "erfc": _of_kinds(math.erfc, "!erfc"),
-    "lgamma": _of_kinds(math.lgamma, "!lgamma"),
+    "lgamma": _of_kinds(_log_gamma, "!lgamma"),
     "nextafter": _of_kinds(np.nextafter, "!nextafter"),
     # Written by `emission`, of several instructions.
     "neg": Operation(np.negative),

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
@@ -13,8 +14,13 @@ from scalarjit.rules.rule import Unsupported
 def check(aval):
     if getattr(aval, "dtype", None) == jax.dtypes.float0:
         return
-    if not hasattr(aval, "shape") or not is_supported(np.dtype(aval.dtype)):
+    if not hasattr(aval, "shape") or not has_scalars(aval.dtype):
         raise Unsupported(f"arrays of {aval}")
+
+
+def has_scalars(dtype: Any) -> bool:
+    """Whether scalars of a type of JAX's are computed; it has some of its own, such as that of keys."""
+    return not jnp.issubdtype(dtype, jax.dtypes.extended) and is_supported(np.dtype(dtype))
 
 
 def stays_as_it_is(jaxpr, num_consts, numbers):

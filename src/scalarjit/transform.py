@@ -62,13 +62,28 @@ def scalarised(function: Callable[..., Any], known: Callable[..., Any] = lambda 
 
     @wraps(function)
     def compute(*args: Any) -> Any:
+        given = jax.tree.leaves(args)
         trace = traced.trace(*args)
-        if trace.jaxpr.effects:  # what is printed, or called back for more than its results
+        jaxpr = trace.jaxpr
+        outside = []
+        if len(jaxpr.in_avals) > len(given):  # numbers from around it that are traced, too, which JAX tells only here
+            jaxpr, outside = _with_constants_as_arguments(jax.make_jaxpr(function)(*args))
+        if jaxpr.effects:  # what is printed, or called back for more than its results
             return traced(*args)
-        found = _bind(map(jnp.asarray, jax.tree.leaves(args)), trace.jaxpr, _Known.of(known(*args)))
+        known_ = (None,) * len(outside) + _Known.of(known(*args))
+        found = _bind([*outside, *map(jnp.asarray, given)], jaxpr, known_)
         return jax.tree.unflatten(jax.tree.structure(trace.out_info), found)
 
     return compute
+
+
+def _with_constants_as_arguments(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
+    """A function whose constants come before its arguments, and these constants."""
+    jaxpr = closed.jaxpr
+    inner = jaxpr.replace(
+        constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=jaxpr.debug_info.with_unknown_names()
+    )
+    return ClosedJaxpr(inner, ()), list(closed.consts)
 
 
 def _bind(args, jaxpr, known=(), derivative=None, batch=None):
@@ -117,6 +132,7 @@ def _jitted(jaxpr, known, derivative, batch):
 
 @scalarised_p.def_abstract_eval
 def _abstract(*avals, jaxpr, known, derivative, batch):
+    assert len(avals) == len(jaxpr.in_avals)  # compiled code reads as many
     return [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in jaxpr.out_avals]
 
 

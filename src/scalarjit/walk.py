@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
@@ -28,13 +27,13 @@ from scalarjit.graph import (
     number_of,
     value_of,
 )
-from scalarjit.operations import is_supported
 from scalarjit.rules import RULES
 from scalarjit.rules.rule import SMALL, Unsupported
 from scalarjit.traced import (
     by_implementation,
     called_by,
     check,
+    has_scalars,
     in_order,
     lengths_of_scan,
     num_equations,
@@ -59,13 +58,13 @@ class Walk:
         return self.equations(closed.jaxpr, consts, inputs)
 
     def _constant(self, value) -> Array:
-        if hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jax.dtypes.extended):
-            raise Unsupported(f"constants of {value.dtype}")
-        value = np.asarray(value)
+        if not hasattr(value, "dtype"):
+            value = np.asarray(value)
         if value.dtype == jax.dtypes.float0:  # the change of a whole number: there is none
             value = np.zeros(value.shape, bool)
-        if not is_supported(value.dtype):
+        if not has_scalars(value.dtype):
             raise Unsupported(f"constants of {value.dtype}")
+        value = np.asarray(value)
         return Entries(self.graph, constants(value), value.dtype)
 
     def equations(self, jaxpr: Jaxpr, consts: list[Array], inputs: list[Array]) -> list[Array]:

@@ -77,3 +77,8 @@ def test_callbacks_are_left_to_xla():
     scalarised(lambda x: jax.debug.callback(told.append, x.sum()) or x * 2)(numbers(3))
     jax.effects_barrier()
     np.testing.assert_allclose(told, np.sum(numbers(3)))
+
+
+def test_random_numbers_have_keys_of_their_own_type():
+    agrees(lambda x: jax.random.normal(jax.random.PRNGKey(3), x.shape) + x, numbers(3))
+    agrees(lambda x: jax.random.uniform(jax.random.key(3), x.shape) * x, numbers(3))

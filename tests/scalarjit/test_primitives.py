@@ -7,6 +7,8 @@ import pytest
 from agreement import agrees, numbers
 from jax import lax
 
+from scalarjit import scalarised
+
 FEW, MANY = (3, 4), (40, 30)
 OF_ONE = {
     "neg": jnp.negative,
@@ -152,6 +154,39 @@ def test_whole_numbers(name, dtype):
         if dtype != np.uint32:
             one = one - dtype(4)
         agrees(WHOLE[name], one, other)
+
+
+ENDS = {
+    "div": lax.div,
+    "rem": lax.rem,
+    "shift_left": lax.shift_left,
+    "shift_right": lax.shift_right_arithmetic,
+    "logical_shift": lax.shift_right_logical,
+}
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int64, np.uint32])
+@pytest.mark.parametrize("name", ENDS)
+def test_whole_numbers_at_their_ends(name, dtype):
+    """The least one by −1, at which processors stop, quotients that reals would round, shifts by all bits and more."""
+    ends = np.iinfo(dtype)
+    ones = np.array([ends.min, ends.max, ends.max - 1, 5, 0], dtype).repeat(8)
+    others = np.tile(np.array([-1, 0, 1, 3, 7, 8, 63, 64]).astype(dtype), 5)
+    agrees(ENDS[name], ones, others)
+    agrees(jax.vmap(ENDS[name]), ones, others)
+    # Of constants, too; XLA ends the process where it computes some of these before a program runs.
+    found = scalarised(lambda zero: ENDS[name](jnp.asarray(ones), jnp.asarray(others)) + zero)(np.zeros(40, dtype))
+    np.testing.assert_array_equal(found, jax.jit(ENDS[name])(ones, others))
+
+
+def test_the_next_number_in_single_precision():
+    one, other = (numbers(*FEW, seed=seed, dtype=np.float32) for seed in (0, 1))
+    agrees(jnp.nextafter, one, other, rtol=0.0, atol=0.0)
+    agrees(jax.vmap(jnp.nextafter), one, other, rtol=0.0, atol=0.0)
+
+
+def test_poles_of_constants():
+    agrees(lambda x: x + lax.lgamma(jnp.array([0.0, -1.0, 1e306])), np.ones(3))
 
 
 @pytest.mark.parametrize("name", ["sin", "products_of_matrices", "sorted", "clamp", "to_int", "sums"])

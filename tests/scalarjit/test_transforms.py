@@ -92,3 +92,15 @@ def test_known_entries_are_taken_for_granted():
     found = function(jnp.full((2, 2), 3.0))
     taken = np.array([[2.0, 3.0], [3.0, 0.0]])
     np.testing.assert_allclose(found, taken @ taken)
+
+
+def test_numbers_from_around_a_function():
+    """That another transformation traces: they have derivatives, and members of a batch their own."""
+
+    def of(wrap):
+        return lambda scale: wrap(lambda x: jnp.sin(scale * x[0]) * x[1])(jnp.array([1.0, 2.0]))
+
+    for transform in (jax.jit, jax.grad, jax.jacfwd, lambda f: jax.jit(jax.hessian(f))):
+        np.testing.assert_allclose(transform(of(scalarised))(0.7), transform(of(lambda f: f))(0.7), rtol=1e-14)
+    scales = jnp.linspace(0.1, 1.0, 11)
+    np.testing.assert_allclose(jax.vmap(of(scalarised))(scales), 2.0 * np.sin(scales), rtol=1e-14)
