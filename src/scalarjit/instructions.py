@@ -84,7 +84,7 @@ class Instructions(Writer):
         none = self.number(kind, 0)
         one = self.number(kind, 1)
         all_bits = self.number(kind, -1)
-        bools = self.vector("i1") if kind.startswith("<") else "i1"
+        bools = self.bools(kind)
         by_none = self.value(f"icmp eq {kind} {texts[1]}, {none}")
         safe = self.value(f"select {bools} {by_none}, {kind} {one}, {kind} {texts[1]}")
         if signed:
@@ -103,13 +103,17 @@ class Instructions(Writer):
         if operands[1] < 0 and 0 <= int(value_of(operands[1])) < bits:
             self.line(f"{own} = {how} {kind} {', '.join(texts)}")
             return
-        bools = self.vector("i1") if kind.startswith("<") else "i1"
+        bools = self.bools(kind)
         none = self.number(kind, 0)
         within = self.value(f"icmp ult {kind} {texts[1]}, {self.number(kind, bits)}")
         places = self.value(f"select {bools} {within}, {kind} {texts[1]}, {kind} {none}")
         found = self.value(f"{how} {kind} {texts[0]}, {places}")
         sign = self.value(f"ashr {kind} {texts[0]}, {self.number(kind, bits - 1)}") if how == "ashr" else none
         self.line(f"{own} = select {bools} {within}, {kind} {found}, {kind} {sign}")
+
+    def bools(self, kind: str) -> str:
+        """The type of tests of a type."""
+        return self.vector("i1") if kind.startswith("<") else "i1"
 
     @staticmethod
     def number(kind: str, value: int) -> str:
@@ -131,7 +135,7 @@ class Instructions(Writer):
         else:
             negative = self.value(f"sub {kind} {self.number(kind, 0)}, {texts[0]}")
             test = self.value(f"icmp slt {kind} {texts[0]}, {self.number(kind, 0)}")
-            bools = self.vector("i1") if kind.startswith("<") else "i1"
+            bools = self.bools(kind)
             self.line(f"{own} = select {bools} {test}, {kind} {negative}, {kind} {texts[0]}")
 
     def _not(self, own, kind, dtype, texts) -> None:
@@ -145,11 +149,11 @@ class Instructions(Writer):
         self.line(f"{own} = fcmp oeq {kind} {difference}, {zero}")
 
     def _select(self, own, kind, dtype, texts) -> None:
-        bools = self.vector("i1") if kind.startswith("<") else "i1"
+        bools = self.bools(kind)
         self.line(f"{own} = select {bools} {texts[0]}, {kind} {texts[1]}, {kind} {texts[2]}")
 
     def _max(self, own, kind, dtype, texts, sign="gt") -> None:
-        bools = self.vector("i1") if kind.startswith("<") else "i1"
+        bools = self.bools(kind)
         if dtype.kind != "f":
             test = self.value(f"icmp {'s' if dtype.kind == 'i' else 'u'}{sign} {kind} {texts[0]}, {texts[1]}")
             self.line(f"{own} = select {bools} {test}, {kind} {texts[0]}, {kind} {texts[1]}")

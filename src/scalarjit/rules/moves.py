@@ -101,9 +101,12 @@ def sliced(graph, name, out, arrays, *, start_indices, limit_indices, strides):
     if isinstance(arrays[0], Entries):
         window = tuple(map(slice, start_indices, limit_indices, strides))
         return Entries(graph, arrays[0].ids[window], out.dtype)
-    place = lambda index: tuple(
-        start + stride * number for start, stride, number in zip(start_indices, strides, index, strict=True)
-    )
+
+    def place(index):
+        return tuple(
+            start + stride * number for start, stride, number in zip(start_indices, strides, index, strict=True)
+        )
+
     return _moved(graph, out, arrays[0], place)
 
 
@@ -111,9 +114,12 @@ def sliced(graph, name, out, arrays, *, start_indices, limit_indices, strides):
 def _rev(graph, name, out, arrays, *, dimensions):
     if isinstance(arrays[0], Entries):
         return Entries(graph, np.flip(arrays[0].ids, dimensions), out.dtype)
-    place = lambda index: tuple(
-        out.shape[axis] - 1 - number if axis in dimensions else number for axis, number in enumerate(index)
-    )
+
+    def place(index):
+        return tuple(
+            out.shape[axis] - 1 - number if axis in dimensions else number for axis, number in enumerate(index)
+        )
+
     return _moved(graph, out, arrays[0], place)
 
 
