@@ -189,6 +189,19 @@ def test_poles_of_constants():
     agrees(lambda x: x + lax.lgamma(jnp.array([0.0, -1.0, 1e306])), np.ones(3))
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("method", ["scan", "scan_unrolled", "sort", "compare_all"])
+def test_searches(method, side):
+    """Among numbers, and zeros with a sign, infinities and what is no number."""
+    ends = np.array([-np.inf, -1.0, -0.0, 0.0, 1.0, np.inf, np.nan])
+    agrees(lambda found, x: jnp.searchsorted(found, x, side=side, method=method), ends, ends)
+    agrees(lambda found, x: jnp.searchsorted(found, x, side=side, method=method), np.arange(5), np.arange(9) - 2)
+
+
+def test_sorting_puts_numbers_that_are_none_last():
+    agrees(lambda x: jnp.sort(x), np.array([np.nan, 1.0, -np.inf, -np.nan, 0.0, np.inf, -0.0]))
+
+
 @pytest.mark.parametrize("name", ["sin", "products_of_matrices", "sorted", "clamp", "to_int", "sums"])
 def test_single_precision(name):
     for shape in FEW, MANY:

@@ -122,6 +122,33 @@ def _same(graph, name, out, arrays, **params):
     return elementwise(graph, out.shape, out.dtype, partial(graph.map, name), *arrays)
 
 
+@rule("lt_to", "le_to", "eq_to")
+def _in_total_order(graph, name, out, arrays):
+    """By which JAX sorts and searches: −0 before 0, and numbers between what is none with and without a sign."""
+    if arrays[0].dtype.kind != "f":
+        return _same(graph, name.removesuffix("_to"), out, arrays)
+    one, zero = constant(1, arrays[0].dtype), constant(0, arrays[0].dtype)
+
+    def before(x, y):
+        signs = [graph.map("copysign", one, number) for number in (x, y)]
+        ends = [
+            graph.map("select", graph.map("eq", number, number), zero, sign)
+            for number, sign in zip((x, y), signs, strict=True)
+        ]
+        of_zeros = graph.map("and", graph.map("eq", x, y), graph.map("lt", *signs))
+        of_numbers = graph.map("or", graph.map("lt", x, y), of_zeros)
+        among = graph.map("and", graph.map("eq", *ends), of_numbers)
+        return graph.map("or", graph.map("lt", *ends), among)
+
+    def compared(x, y):
+        if name == "lt_to":
+            return before(x, y)
+        at_most = graph.map("not", before(y, x))
+        return at_most if name == "le_to" else graph.map("and", at_most, graph.map("not", before(x, y)))
+
+    return elementwise(graph, out.shape, out.dtype, compared, *arrays)
+
+
 @rule("add_any")
 def _add_any(graph, name, out, arrays):
     return _same(graph, "add", out, arrays)
