@@ -20,11 +20,11 @@ import numpy as np
 
 import linkax as lx
 from benchmarks.batches import MJX, PROBLEM, cheapest_tolerance, masses, simulated
+from benchmarks.evaluation import evaluate
 from benchmarks.parts import print_parts
 from benchmarks.peers.kinematics import judge
 from benchmarks.peers.runs import GaveUp
 from benchmarks.problems import PROBLEMS, TIMES
-from benchmarks.straight_line import evaluate
 from linkax.equations.system import system_of
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)

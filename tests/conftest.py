@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from program_folder import forget_oldest, program_folder  # noqa: E402
 
 from linkax.xla import memory_maps  # noqa: E402
-from linkax.xla.kept_programs import keep_in  # noqa: E402
+from scalarjit import keep_in  # noqa: E402
 
 pytest_plugins = ["annotations", "processor_time", "slow_tests"]
 

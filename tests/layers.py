@@ -1,6 +1,6 @@
 """The layers of linkax, from the lowest to the highest, as CONTRIBUTING says: rooms of a layer as layer.room."""
 
-LAYERS = ["files", "optional", "xla", "tables", "straight_line", "spatial", "model", "linalg", "equations"]
+LAYERS = ["files", "optional", "xla", "tables", "spatial", "model", "linalg", "equations"]
 LAYERS += ["formulations"]
 LAYERS += [f"simulation.{room}" for room in ("start", "integrate", "explain", "read", "simulate")]
 LAYERS += ["analysis"]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import jaxlib
 
-from linkax.xla.descriptions import of_processor
 from linkax.xla.program_cache import users_folder
+from scalarjit.descriptions import of_processor
 
 MOST_BYTES = 2**30  # a run of all fast tests writes a tenth of that
 

@@ -2,9 +2,8 @@
 
 Importing linkax switches JAX to double precision (`jax_enable_x64`): loops cannot be closed to
 rounding, nor singular configurations passed, in single precision. `simulate(dtype=jnp.float32)`
-computes in single precision all the same. It also adds to `XLA_FLAGS` what lets small mechanisms run fast on a CPU,
-see `linkax.xla.flags`; import linkax before JAX makes its first array. And SciPy's LAPACK, which compiled programs
-call, gets one thread, unless `OPENBLAS_NUM_THREADS` or the like say otherwise, see `linkax.xla.lapack_threads`.
+computes in single precision all the same. And SciPy's LAPACK, which compiled programs call, gets one thread, unless
+`OPENBLAS_NUM_THREADS` or the like say otherwise, see `linkax.xla.lapack_threads`.
 """
 
 from importlib import import_module as _import_module
@@ -14,12 +13,10 @@ from typing import Any as _Any
 
 import jax
 
-from linkax.xla.flags import set_flags
 from linkax.xla.lapack_threads import watch_lapack
 from linkax.xla.memory_maps import watch_memory_maps
 
 jax.config.update("jax_enable_x64", True)
-set_flags()
 watch_lapack()
 watch_memory_maps()
 
@@ -231,5 +228,5 @@ def __dir__() -> list[str]:
 
 
 globals().update(explain_slips({name: entry for name, entry in globals().items() if name in __dir__()}))
-del explain_slips, jax, set_flags, watch_lapack, watch_memory_maps
+del explain_slips, jax, watch_lapack, watch_memory_maps
 __all__ = __dir__()  # pyright: ignore[reportUnsupportedDunderAll]

@@ -7,30 +7,54 @@ from typing import Any
 
 import numpy as np
 
-from scalarjit.compiler import Beside, loaded, object_code
-from scalarjit.emission import CALLEES, Code, emitted
+from scalarjit import files
+from scalarjit.compiler import Beside, digest, file_of, kept_or_compiled, loaded
+from scalarjit.emission import CALLEES, emitted
 from scalarjit.function import Function
 
 OFTEN = 2000  # calls after which a function is compiled with care, and passes of loops in it
 PAUSE = 0.02  # between two looks at how often functions have been called [s]
-CARE = 2  # level of optimisation then
+CARE = 1  # level of optimisation then
+SYMBOL = "scalars"
 
 _lock = threading.RLock()
 
 
-class Compiled:
-    """A function in this process, for a number of members at once.
+class Unit:
+    """Code of a function for a number of members at once, without addresses: another process may have it too.
 
-    - `cell`: address of its code, number of calls, and the addresses of the cells of what it calls.
-    - `memory`: bytes that it needs, with what it calls.
+    - `callees`: what it calls, in the order of its cell; `memory`: bytes that it needs, with what it calls.
+    - `key`: what tells it from others, by its text and what it calls.
     """
 
-    def __init__(self, function: Function, lanes: int) -> None:
-        # Not the function itself: what is compiled goes with it.
-        self.symbol = "scalars"
-        self.code: Code = emitted(function, lanes, self.symbol)
-        self.callees = [compiled(each, lanes) for each in self.code.callees]
-        self.memory = self.code.own_memory + max((each.memory for each in self.callees), default=0)
+    def __init__(self, text: str, own_memory: int, callees: "list[Unit]") -> None:
+        self.text, self.callees = text, callees
+        self.memory = own_memory + max((each.memory for each in callees), default=0)
+        self.key = digest(text, *(each.key for each in callees))
+
+
+_units: "weakref.WeakKeyDictionary[Function, dict[int, Unit]]" = weakref.WeakKeyDictionary()
+
+
+def unit(function: Function, lanes: int) -> Unit:
+    """Give the code of a function, which is written once."""
+    with _lock:
+        versions = _units.setdefault(function, {})
+        if lanes not in versions:
+            code = emitted(function, lanes, SYMBOL)
+            versions[lanes] = Unit(code.text, code.own_memory, [unit(each, lanes) for each in code.callees])
+        return versions[lanes]
+
+
+class Compiled:
+    """A unit in this process.
+
+    - `cell`: address of its code, number of calls, and the addresses of the cells of what it calls.
+    """
+
+    def __init__(self, unit: Unit) -> None:
+        self.text = unit.text
+        self.callees = [compiled(each) for each in unit.callees]
         self.cell = np.zeros(CALLEES + len(self.callees), np.int64)
         self.cell[CALLEES:] = [each.cell.ctypes.data for each in self.callees]
         self.engines: list[Any] = []
@@ -39,22 +63,22 @@ class Compiled:
         """Have code called from now on."""
         engine = loaded(code)
         self.engines.append(engine)
-        self.cell[0] = engine.get_function_address(self.symbol)
+        self.cell[0] = engine.get_function_address(SYMBOL)
 
 
-_compiled: "weakref.WeakKeyDictionary[Function, dict[int, Compiled]]" = weakref.WeakKeyDictionary()
+_compiled: "weakref.WeakValueDictionary[str, Compiled]" = weakref.WeakValueDictionary()
 
 
-def compiled(function: Function, lanes: int) -> Compiled:
-    """Give a function that is ready to be called."""
+def compiled(unit: Unit) -> Compiled:
+    """Give a unit that is ready to be called; equal ones are compiled once."""
     with _lock:
-        versions = _compiled.setdefault(function, {})
-        if lanes not in versions:
-            made = Compiled(function, lanes)
-            made.load(object_code(made.code.text, 0))
-            versions[lanes] = made
+        made = _compiled.get(unit.key)
+        if made is None:
+            made = Compiled(unit)
+            made.load(kept_or_compiled(unit.text, 0))
+            _compiled[unit.key] = made
             _watch(made)
-        return versions[lanes]
+        return made
 
 
 # A thread that has compiled again what runs often.
@@ -81,16 +105,24 @@ def _end() -> None:
 
 
 def _improve() -> None:
-    global _beside
+    """Compile again what has been called often, the most often called first."""
     while not _stop.wait(PAUSE):
-        for made in list(_watched):
-            if made.cell[1] <= OFTEN or _stop.is_set():
-                continue
-            _watched.discard(made)
-            try:
-                _beside = _beside or Beside(CARE)
-                code = _beside.object_code(made.code.text)
-            except (OSError, EOFError):  # no process may be started here, or it has ended
-                return
-            if not _stop.is_set():
-                made.load(code)
+        often = [made for made in list(_watched) if made.cell[1] > OFTEN]
+        if not often:
+            continue
+        made = max(often, key=lambda made: made.cell[1])
+        _watched.discard(made)
+        try:
+            code = files.read(file_of(made.text, CARE)) or _compiled_beside(made.text)
+        except (OSError, EOFError):  # no process may be started here, or it has ended
+            return
+        if not _stop.is_set():
+            made.load(code)
+
+
+def _compiled_beside(text: str) -> bytes:
+    global _beside
+    _beside = _beside or Beside(CARE)
+    code = _beside.object_code(text)
+    files.write(file_of(text, CARE), code)
+    return code

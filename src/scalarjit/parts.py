@@ -25,6 +25,8 @@ def is_compilable(jaxpr: Jaxpr) -> bool:
 
 
 def _has_rule(equation):
+    if equation.effects:
+        return False
     try:
         for var in (*equation.invars, *equation.outvars):
             check(var.aval)

@@ -1,10 +1,9 @@
-"""The decorator: functions of arrays, compiled by LLVM, under JAX's transformations."""
+"""Functions of arrays, compiled by LLVM, under JAX's transformations: a primitive."""
 
 import itertools
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import wraps
+from functools import cached_property, lru_cache, wraps
 from typing import Any, NamedTuple
 
 import jax
@@ -17,17 +16,22 @@ from scalarjit.arrays import NONE
 from scalarjit.function import Function
 from scalarjit.functions import function_of
 from scalarjit.graph import constants, value_of
+from scalarjit.known import Pattern
 from scalarjit.parts import in_parts, is_compilable
 
 try:
-    from scalarjit.handlers import Handler
+    from scalarjit.handlers import handler_of
 except (ImportError, OSError) as error:
-    Handler = None
+    handler_of = None
     warnings.warn(
         f"scalarjit: functions are left to XLA, as llvmlite does not load: {error}", RuntimeWarning, stacklevel=2
     )
 
-LANES = 8  # members of a batch in one vector
+LANES = 8  # members of a batch in one vector, at most
+MOST_SOURCES = 4096  # functions that are found again where JAX has traced them
+
+Known = tuple[Pattern | None, ...]
+Moves = tuple[bool, ...]  # which arguments have a change
 
 
 class Batch(NamedTuple):
@@ -37,103 +41,123 @@ class Batch(NamedTuple):
     batched: tuple[bool, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Derivative:
-    """That a function is the change of another one, with those of its arguments that move: linear in their changes."""
+class Source:
+    """What is compiled: a function that JAX has traced; what has been made of it lives as long.
 
-    jaxpr: ClosedJaxpr
-    moves: tuple[bool, ...]
+    - `known`: of each argument a `Pattern` or None.
+    - `change_of`: of which function this is the change, and which of its arguments move: it is linear in their changes.
+    """
 
+    def __init__(self, jaxpr: ClosedJaxpr, known: Known, change_of: "tuple[Source, Moves] | None" = None) -> None:
+        self.jaxpr, self.known, self.change_of = jaxpr, known, change_of
+        self._handlers: dict[Batch | None, str] = {}
+        self._jitted: dict[Batch | None, Any] = {}
+        self._changes: dict[Moves, Source] = {}
+        self._pulled_back: dict[Moves, Source] = {}
+
+    def __repr__(self) -> str:  # JAX prints parameters of primitives where it transforms them
+        return f"<{len(self.jaxpr.eqns)} equations>"
+
+    @cached_property
+    def function(self) -> Function:
+        """What LLVM compiles."""
+        known = itertools.zip_longest(self.known, self.jaxpr.in_avals)
+        return function_of(self.jaxpr, [_constants(pattern, aval) for pattern, aval in known])
+
+    def handler(self, batch: Batch | None) -> str:
+        """The name by which JAX calls it."""
+        if batch not in self._handlers:
+            assert handler_of is not None
+            members, batched = batch or (None, ())
+            lanes = min(LANES, 1 << ((members or 1) - 1).bit_length())
+            handler = handler_of(self.function, lanes, members, batched)
+            handler.register()
+            self._handlers[batch] = handler.name
+        return self._handlers[batch]
+
+    def jitted(self, batch: Batch | None) -> Callable[..., list[Any]]:
+        """A program of this alone."""
+        if batch not in self._jitted:
+            self._jitted[batch] = jax.jit(lambda *args: _bind(args, self, batch))
+        return self._jitted[batch]
+
+    def change(self, moves: Moves) -> "Source":
+        """How what it returns changes, of its arguments and the changes of those that move."""
+        if moves not in self._changes:
+            self._changes[moves] = Source(_change(self.jaxpr, moves), self.known, (self, moves))
+        return self._changes[moves]
+
+    def pulled_back(self, moves: Moves) -> "Source":
+        """Cotangents of arguments that move, of all arguments and the cotangents of what it returns that is real."""
+        if moves not in self._pulled_back:
+            self._pulled_back[moves] = Source(_pulled_back(self.jaxpr, moves), self.known)
+        return self._pulled_back[moves]
+
+
+_source = lru_cache(MOST_SOURCES)(Source)
 
 scalarised_p = Primitive("scalarised")
 scalarised_p.multiple_results = True
 
 
-def scalarised(function: Callable[..., Any], known: Callable[..., Any] = lambda *_: ()) -> Callable[..., Any]:
-    """Compile a function of arrays by LLVM.
+def compiled_by_llvm(function: Callable[..., Any], known: Callable[..., Any] = lambda *_: ()) -> Callable[..., Any]:
+    """Compile a function of pytrees of arrays, which JAX traces once for each kind of arguments.
 
-    It computes what `jax.jit(function)` does, under JAX's transformations too. What it consists of is unrolled where
-    that is short: constants fold, entries that are zero cost nothing, and equal ones are computed once.
-
-    **Arguments:** `function`: of pytrees of arrays, that JAX can trace. `known`: of the same arguments, for each of
-    their arrays the values that the program may take for granted, and NaN for others; or None.
+    **Arguments:** `known`: of the same arguments, a `Pattern` or None for each of their arrays.
     """
     traced = jax.jit(function)
 
     @wraps(function)
-    def compute(*args: Any) -> Any:
+    def flat(*args: Any) -> Any:
         given = jax.tree.leaves(args)
         trace = traced.trace(*args)
         jaxpr = trace.jaxpr
+        out = trace.out_info
         outside = []
-        if len(jaxpr.in_avals) > len(given):  # numbers from around it that are traced, too, which JAX tells only here
-            jaxpr, outside = _with_constants_as_arguments(jax.make_jaxpr(function)(*args))
-        if jaxpr.effects:  # what is printed, or called back for more than its results
-            return traced(*args)
-        known_ = (None,) * len(outside) + _Known.of(known(*args))
-        found = _bind([*outside, *map(jnp.asarray, given)], jaxpr, known_)
-        return jax.tree.unflatten(jax.tree.structure(trace.out_info), found)
+        if len(jaxpr.jaxpr.invars) > len(given):  # numbers from outside that are traced, which JAX does not tell here
+            jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*args)
+            jaxpr, outside = _with_constants_as_arguments(jaxpr)
+        known_entries = (None,) * len(outside) + tuple(known(*args))
+        # What is printed, or called back for more than its results, is left to XLA.
+        compute = in_parts(jaxpr, known_entries, _bind_part) if jaxpr.effects else _bind_part(jaxpr, known_entries)
+        found = compute(*outside, *map(jnp.asarray, given))
+        return jax.tree.unflatten(jax.tree.structure(out), found)
 
-    return compute
+    return flat
 
 
 def _with_constants_as_arguments(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
-    """A function whose constants come before its arguments, and these constants."""
     jaxpr = closed.jaxpr
     inner = jaxpr.replace(
         constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=jaxpr.debug_info.with_unknown_names()
     )
-    return ClosedJaxpr(inner, ()), list(closed.consts)
+    return ClosedJaxpr(inner, []), list(closed.consts)
 
 
-def _bind(args, jaxpr, known=(), derivative=None, batch=None):
-    return scalarised_p.bind(*args, jaxpr=jaxpr, known=known, derivative=derivative, batch=batch)
+def _bind_part(part, known):
+    source = _source(part, known)
+    return lambda *args: _bind(args, source)
 
 
-@dataclass(frozen=True)
-class _Known:
-    """What is known of an array: its values, NaN where they are not."""
-
-    shape: tuple[int, ...]
-    values: bytes
-
-    @staticmethod
-    def of(arrays: Any) -> tuple["_Known | None", ...]:
-        return tuple(None if array is None else _Known(array.shape, array.tobytes()) for array in arrays)
-
-    def constants(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        values = np.broadcast_to(np.frombuffer(self.values).reshape(self.shape), shape)
-        return np.where(np.isnan(values), NONE, constants(values.astype(dtype)))
+def _bind(args, source, batch=None):
+    return scalarised_p.bind(*args, source=source, batch=batch)
 
 
-def _once(function):
-    """Keep what a function made of a jaxpr, and of what else it takes."""
-    made: dict[Any, Any] = {}
-
-    @wraps(function)
-    def find(jaxpr, *more):
-        key = id(jaxpr), *more
-        if key not in made:
-            made[key] = jaxpr, function(jaxpr, *more)
-        return made[key][1]
-
-    return find
+def _constants(pattern, aval):
+    if pattern is None:
+        return None
+    values = np.broadcast_to(pattern.values, aval.shape)
+    return np.where(np.isnan(values), NONE, constants(values.astype(aval.dtype)))
 
 
 @scalarised_p.def_impl
-def _now(*args, jaxpr, known, derivative, batch):
-    return _jitted(jaxpr, known, derivative, batch)(*args)
-
-
-@_once
-def _jitted(jaxpr, known, derivative, batch):
-    return jax.jit(lambda *args: _bind(args, jaxpr, known, derivative, batch))
+def _now(*args, source, batch):
+    return source.jitted(batch)(*args)
 
 
 @scalarised_p.def_abstract_eval
-def _abstract(*avals, jaxpr, known, derivative, batch):
-    assert len(avals) == len(jaxpr.in_avals)  # compiled code reads as many
-    return [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in jaxpr.out_avals]
+def _abstract(*avals, source, batch):
+    return [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in source.jaxpr.out_avals]
 
 
 def _lead(batch):
@@ -142,50 +166,19 @@ def _lead(batch):
 
 # Code.
 
-_names = itertools.count()
-_kept: list[Any] = []  # handlers, which JAX's programs may call as long as the process lives
 
-
-@_once
-def _function(jaxpr: ClosedJaxpr, known: tuple[_Known | None, ...]) -> Function:
-    """What LLVM compiles."""
-    return function_of(
-        jaxpr,
-        [
-            None if each is None else each.constants(aval.shape, np.dtype(aval.dtype))
-            for each, aval in itertools.zip_longest(known, jaxpr.in_avals)
-        ],
-    )
-
-
-@_once
-def _handler(jaxpr: ClosedJaxpr, known: tuple[_Known | None, ...], batch: Batch | None) -> str:
-    """The name by which JAX calls the function of a jaxpr."""
-    function = _function(jaxpr, known)
-    assert Handler is not None
-    members, batched = batch or (None, ())
-    handler = Handler(function, 1 if batch is None else LANES, members, batched)
-    _kept.append(handler)
-    name = f"scalarjit_{next(_names)}"
-    jax.ffi.register_ffi_target(name, handler.capsule, platform="cpu", api_version=1)
-    return name
-
-
-def _called(*args, jaxpr, known, derivative, batch):
+def _called(*args, source, batch):
     """A call of compiled code among XLA's operations."""
-    if Handler is None:
-        return _as_it_stands(*args, jaxpr=jaxpr, known=known, derivative=derivative, batch=batch)
-    if not is_compilable(jaxpr.jaxpr):
-        compile = lambda part, known: lambda *args: _bind(args, part, known)
-        return _of_members(in_parts(jaxpr, known, compile), args, batch)
-    function = _function(jaxpr, known)
+    if handler_of is None:
+        return _as_it_stands(*args, source=source, batch=batch)
+    if not is_compilable(source.jaxpr.jaxpr):
+        return _of_members(in_parts(source.jaxpr, source.known, _bind_part), args, batch)
     lead = _lead(batch)
-    written = [
-        jax.ShapeDtypeStruct((*lead, *result.shape), result.dtype) for result in function.results if result.is_written
-    ]
-    found = iter(jax.ffi.ffi_call(_handler(jaxpr, known, batch), written)(*args)) if written else iter(())
+    results = source.function.results
+    written = [jax.ShapeDtypeStruct((*lead, *result.shape), result.dtype) for result in results if result.is_written]
+    found = iter(jax.ffi.ffi_call(source.handler(batch), written)(*args)) if written else iter(())
     outs = []
-    for result in function.results:
+    for result in results:
         if result.is_written:
             outs.append(next(found))
             continue
@@ -199,8 +192,8 @@ def _values(result):
     return np.array(flat, result.dtype).reshape(result.shape)
 
 
-def _as_it_stands(*args, jaxpr, known, derivative, batch):
-    return _of_members(jaxpr_as_fun(jaxpr), args, batch)
+def _as_it_stands(*args, source, batch):
+    return _of_members(jaxpr_as_fun(source.jaxpr), args, batch)
 
 
 def _of_members(compute, args, batch):
@@ -217,7 +210,7 @@ mlir.register_lowering(scalarised_p, mlir.lower_fun(_called, multiple_results=Tr
 # Batches.
 
 
-def _batched(args, dims, *, jaxpr, known, derivative, batch):
+def _batched(args, dims, *, source, batch):
     """Members of a batch of batches are members of one."""
     count = next(arg.shape[dim] for arg, dim in zip(args, dims, strict=True) if dim is not None)
     inner = batch or Batch(1, (False,) * len(args))
@@ -233,7 +226,7 @@ def _batched(args, dims, *, jaxpr, known, derivative, batch):
             arg = arg.reshape(count * inner.members, *arg.shape[2:])
         rows.append(arg)
     flags = tuple(dim is not None or has_rows for dim, has_rows in zip(dims, inner.batched, strict=True))
-    found = _bind(rows, jaxpr, known, derivative, Batch(count * inner.members, flags))
+    found = _bind(rows, source, Batch(count * inner.members, flags))
     if batch is not None:
         found = [array.reshape(count, inner.members, *array.shape[1:]) for array in found]
     return found, [0] * len(found)
@@ -245,9 +238,7 @@ batching.primitive_batchers[scalarised_p] = _batched
 # Derivatives.
 
 
-@_once
-def _change_of(jaxpr: ClosedJaxpr, moves: tuple[bool, ...]) -> tuple[ClosedJaxpr, Derivative]:
-    """How what a function returns changes, of its arguments and the changes of those that move."""
+def _change(jaxpr, moves):
     compute = jaxpr_as_fun(jaxpr)
 
     def change(args, changes):
@@ -257,12 +248,10 @@ def _change_of(jaxpr: ClosedJaxpr, moves: tuple[bool, ...]) -> tuple[ClosedJaxpr
         return [part for part, aval in zip(found, jaxpr.out_avals, strict=True) if _is_real(aval)]
 
     args = _shapes(jaxpr.in_avals)
-    return jax.make_jaxpr(change)(args, _moving(args, moves)), Derivative(jaxpr, moves)
+    return jax.make_jaxpr(change)(args, _moving(args, moves))
 
 
-@_once
-def _pulled_back(jaxpr: ClosedJaxpr, moves: tuple[bool, ...]) -> ClosedJaxpr:
-    """Cotangents of the arguments that move, of the arguments and the cotangents of what is real in what it returns."""
+def _pulled_back(jaxpr, moves):
     compute = jaxpr_as_fun(jaxpr)
 
     def pull(args, cotangents):
@@ -293,31 +282,30 @@ def _no_change(arg):
     return jnp.zeros_like(arg) if _is_real(arg) else np.zeros(arg.shape, jax.dtypes.float0)
 
 
-def _jvp(args, tangents, *, jaxpr, known, derivative, batch):
-    found = _bind(args, jaxpr, known, derivative, batch)
+def _jvp(args, tangents, *, source, batch):
+    found = _bind(args, source, batch)
     moves = tuple(not isinstance(tangent, ad.Zero) for tangent in tangents)
-    change, of = _change_of(jaxpr, moves)
     rows = None if batch is None else Batch(batch.members, (*batch.batched, *_moving(batch.batched, moves)))
-    changed = iter(_bind([*args, *_moving(tangents, moves)], change, known, of, rows))
+    changed = iter(_bind([*args, *_moving(tangents, moves)], source.change(moves), rows))
     return found, [next(changed) if _is_real(out) else ad.Zero(jax.typeof(out).to_tangent_aval()) for out in found]
 
 
-def _transpose(cotangents, *args, jaxpr, known, derivative, batch):
-    given = args[: len(derivative.moves)]
-    outs = [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in derivative.jaxpr.out_avals if _is_real(aval)]
+def _transpose(cotangents, *args, source, batch):
+    of, moves = source.change_of
+    given = args[: len(moves)]
+    outs = [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in of.jaxpr.out_avals if _is_real(aval)]
     cotangents = [
         jnp.zeros(aval.shape, aval.dtype) if isinstance(cotangent, ad.Zero) else cotangent
         for cotangent, aval in zip(cotangents, outs, strict=True)
     ]
-    pulled = _pulled_back(derivative.jaxpr, derivative.moves)
+    pulled = of.pulled_back(moves)
     if batch is None:
-        return [None] * len(given) + _bind([*given, *cotangents], pulled, known)
+        return [None] * len(given) + _bind([*given, *cotangents], pulled)
     batched = batch.batched[: len(given)]
-    rows = Batch(batch.members, (*batched, *[True] * len(cotangents)))
-    found = _bind([*given, *cotangents], pulled, known, None, rows)
+    found = _bind([*given, *cotangents], pulled, Batch(batch.members, (*batched, *[True] * len(cotangents))))
     back = [
         array if is_batched else jnp.sum(array, axis=0)
-        for array, is_batched in zip(found, _moving(batched, derivative.moves), strict=True)
+        for array, is_batched in zip(found, _moving(batched, moves), strict=True)
     ]
     return [None] * len(given) + back
 

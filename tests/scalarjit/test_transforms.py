@@ -7,7 +7,7 @@ import pytest
 from agreement import numbers
 from jax import lax
 
-from scalarjit import scalarised
+from scalarjit import scalarised, with_known_entries
 
 
 def few(x, y):
@@ -87,20 +87,10 @@ def test_within_each_other():
 
 def test_known_entries_are_taken_for_granted():
     """They need not be the ones that are passed."""
-    known = np.array([[2.0, np.nan], [np.nan, 0.0]])
-    function = scalarised(lambda x: x @ x, known=lambda x: [known])
-    found = function(jnp.full((2, 2), 3.0))
-    taken = np.array([[2.0, 3.0], [3.0, 0.0]])
-    np.testing.assert_allclose(found, taken @ taken)
-
-
-def test_numbers_from_around_a_function():
-    """That another transformation traces: they have derivatives, and members of a batch their own."""
-
-    def of(wrap):
-        return lambda scale: wrap(lambda x: jnp.sin(scale * x[0]) * x[1])(jnp.array([1.0, 2.0]))
-
-    for transform in (jax.jit, jax.grad, jax.jacfwd, lambda f: jax.jit(jax.hessian(f))):
-        np.testing.assert_allclose(transform(of(scalarised))(0.7), transform(of(lambda f: f))(0.7), rtol=1e-14)
-    scales = jnp.linspace(0.1, 1.0, 11)
-    np.testing.assert_allclose(jax.vmap(of(scalarised))(scales), 2.0 * np.sin(scales), rtol=1e-14)
+    function = scalarised(lambda flat: flat.tree @ flat.tree)
+    given = with_known_entries(np.array([[1.0, 2.0], [5.0, 0.0]]))
+    others = jax.tree.map(lambda array: 0.0 * array + 3.0, given)
+    taken = np.array([[1.0, 3.0], [3.0, 0.0]])
+    np.testing.assert_allclose(function(others), taken @ taken)
+    slopes = jax.grad(lambda flat: jnp.sum(function(flat)))(given).tree
+    np.testing.assert_allclose(slopes, jax.grad(lambda x: jnp.sum(x @ x))(given.tree))

@@ -18,7 +18,7 @@ from refusals import Shown, refused
 import linkax as lx
 from linkax.simulation.integrate.run import Run, checked_formulation
 from linkax.simulation.start.validation import sound_numbers
-from linkax.xla.program import Program
+from scalarjit.program import Scalarised
 
 MECHANISM = crank_slider()
 N_Q, N_V = MECHANISM.topology.num_coordinates, MECHANISM.topology.num_speeds
@@ -35,8 +35,8 @@ def _nothing_compiled(monkeypatch):
     def never(*arguments):
         pytest.fail("refused only after a program was made")
 
-    monkeypatch.setattr(Program, "__call__", never)
-    monkeypatch.setattr(Program, "lower", property(never))
+    monkeypatch.setattr(Scalarised, "__call__", never)
+    monkeypatch.setattr(Scalarised, "lower", never)
 
 
 NO_NUMBER = [np.nan, np.inf, None, "long", "1.0", 1.0j, True, [1.0, 2.0], jnp.asarray([1.0]), jnp.asarray(np.nan), {}]

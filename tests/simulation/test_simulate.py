@@ -15,7 +15,7 @@ from mechanisms import crank_slider, pendulum
 import linkax as lx
 from linkax.cli import progress_run
 from linkax.simulation.read.observables import Observables
-from linkax.xla.program import Program
+from scalarjit.program import Scalarised
 
 PENDULUM, START = pendulum(), lx.State(jnp.array([0.3]), jnp.zeros(1))
 
@@ -92,8 +92,10 @@ def test_a_time_saved_more_than_once_holds_one_state():
 def test_a_reading_is_computed_once(monkeypatch):
     computed = []
     found = lx.simulate(PENDULUM, START, t1=1.0)
-    compute = Program.__call__
-    monkeypatch.setattr(Program, "__call__", lambda self, of, *given: computed.append(of) or compute(self, of, *given))
+    compute = Scalarised.__call__
+    monkeypatch.setattr(
+        Scalarised, "__call__", lambda self, of, *given: computed.append(of) or compute(self, of, *given)
+    )
     first, again = found.reaction("hinge"), found.reaction("hinge")
     np.testing.assert_array_equal(first.force, again.force)
     assert computed == [Observables.solve, Observables.reactions]

@@ -11,17 +11,12 @@ from known_answers import PASSING, REDUNDANT, known_slider_end, slider_end, slid
 from mechanisms import pendulum
 
 import linkax as lx
-from linkax.xla.flags import makes_kernels_of_loops
 
 pytestmark = pytest.mark.users_settings
 
 KNOWN = {name: known for name, known in (PASSING | REDUNDANT).items() if known.scene != "spatial-four-link"}
 BOUNDS = {"SC3": 5e-9, "A02-1": 1e-7, "A02-2": 1e-7, "A02-5": 1e-6}
 MASSES = np.array([0.5, 1.0, 2.0])
-
-
-def test_these_are_the_settings_of_users():
-    assert makes_kernels_of_loops()
 
 
 @pytest.mark.parametrize(
@@ -72,9 +67,3 @@ def in_one_program():
 def test_assembly_may_be_part_of_a_program_with_callbacks(in_one_program):
     """Errors of Equinox call back to Python, which XLA finds no way to from some programs with loops."""
     np.testing.assert_allclose(in_one_program(0.4), end_of_motion(0.4), rtol=1e-10)
-
-
-def test_the_loop_over_steps_is_one_kernel(in_one_program):
-    _, _, entry = in_one_program.as_text().partition("\nENTRY")
-    loops = [line for line in entry.splitlines() if " while(" in line or "xla_cpu_small_call" in line]
-    assert [" while(" in line for line in loops if "diffeqsolve" in line] == [False]

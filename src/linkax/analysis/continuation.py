@@ -24,9 +24,9 @@ from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import dot, largest, length
-from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import positive_or_one, ratio
+from linkax.xla.tracing import jit_inline
 
 MOST_CORRECTIONS = 5
 CONVERGED = 1e-8  # correction after which the next one is rounding [rad, lengths of the mechanism]
@@ -135,7 +135,7 @@ class Way(eqx.Module):
             constraints[row] = Coupling(drive.name, {drive.terms[0]: 1.0}, values[value])
         system = self.system
         if self.followed:
-            system = dataclasses.replace(system, constraints=tuple(constraints), known=None)
+            system = dataclasses.replace(system, constraints=tuple(constraints))
         return LoopClosure(system, self.t, self.held.filled(values))
 
     @property
@@ -150,7 +150,7 @@ class Way(eqx.Module):
         factors = jnp.concatenate([jnp.ones(self.num_loop_rows, rows.dtype), values.astype(rows.dtype)])
         return rows * factors.reshape(-1, *(1,) * (rows.ndim - 1))
 
-    @straight_line
+    @jit_inline
     def correction(
         self, q: Float[Array, " n_q"], values: Float[Array, " k"]
     ) -> tuple[Float[Array, " n_v"], Float[Array, ""], Float[Array, ""]]:
@@ -177,7 +177,7 @@ class Way(eqx.Module):
         """Split the space of speeds by all rows, in the identity metric."""
         return invert(None, self.in_scales(slopes), self.system.scales, rank_tolerance(slopes.dtype))
 
-    @straight_line
+    @jit_inline
     def place(self, q: Float[Array, " n_q"], asked: Asked, before: Before) -> Place:
         """How the way goes on from coordinates q on it.
 

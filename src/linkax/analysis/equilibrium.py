@@ -27,10 +27,10 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked, require_double_precision
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, evaluate_now
 from linkax.xla.undefined import nan_where
 from linkax.xla.users_line import warn
+from scalarjit import scalarised
 
 BALANCED_STEP = 1e-8  # last step above which the search has failed [rad, lengths of the mechanism]
 
@@ -148,7 +148,7 @@ def _check_steady(mechanism, ending, reached, t):
         )
 
 
-@Program
+@scalarised
 def _equilibrium(mechanism, state, t, moves):
     """The state in which the search ends, and its `_Ending`."""
     system = system_in(mechanism, state, t, moves)

@@ -28,9 +28,9 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked, speeds_by_joint
 from linkax.tables import Rows, Table, numbers, printed_as
 from linkax.xla.arrays import Array
-from linkax.xla.program import Program
 from linkax.xla.tracing import concrete
 from linkax.xla.undefined import nan_where
+from scalarjit import scalarised
 
 JointKey = str | tuple[str, int]
 Accelerations = Mapping[JointKey, ArrayLike | Sequence[float]]
@@ -107,7 +107,7 @@ def inverse_dynamics(
     return marked(mechanism, InverseDynamics(of_joint, acceleration))
 
 
-@Program
+@scalarised
 def _inverse_dynamics(mechanism, state, wanted, t):
     system, (q, v) = bound(system_of(mechanism, state.q.dtype), state.internal), (state.q, state.v)
     configuration = configure(system, t, q)

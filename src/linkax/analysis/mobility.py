@@ -23,7 +23,7 @@ from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
-from linkax.xla.program import Program
+from scalarjit import scalarised
 
 INVOLVED = 1e-6  # entry of a self-stress of magnitude one up to which its row counts as not part of it
 # Table 1 of the paper: which axes of parent and child each rotation row keeps orthogonal.
@@ -180,7 +180,7 @@ def mobility(
     return marked(mechanism, _mobility(mechanism, state, t, tangent_space))
 
 
-@Program
+@scalarised
 def _mobility(mechanism, state, t, tangent_space):
     system, topology = system_of(mechanism, state.q.dtype, fixed_scales=False), mechanism.topology
     tolerance = tangent_space.prepared(system.dtype).tolerance

@@ -44,7 +44,7 @@ def system_in(mechanism: Mechanism, state: State, t: Float[Array, ""], moves: bo
     """The mechanism's numbers; where all speeds of the state are zero, drives hold their joints as at time t [s]."""
     system, unless = system_of(mechanism, state.q.dtype), jnp.any(state.v != 0.0) if moves else False
     constraints = tuple(each.held(t, unless) for each in system.constraints)
-    return dataclasses.replace(system, constraints=constraints, known=None)
+    return dataclasses.replace(system, constraints=constraints)
 
 
 def limit(most: float, dtype: DTypeLike) -> float:

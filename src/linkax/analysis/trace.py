@@ -31,12 +31,11 @@ from linkax.simulation.start.closing import CLOSED
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, require_double_precision, sound_numbers
 from linkax.spatial.vectors import cross, dot, length
-from linkax.straight_line.known import flat_with_known
 from linkax.tables import Rows, Table, batch, count, known, numbers, printed_as
 from linkax.xla.arrays import Array
-from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, concrete, is_first
 from linkax.xla.waiting import compiling
+from scalarjit import scalarised, with_known_entries
 
 Values = Mapping[str, ArrayLike | list[Any] | Pose] | Mapping[TermLike, ArrayLike | list[Any] | Pose]
 
@@ -222,7 +221,7 @@ def trace(
     else:
         given = "neither along nor arc_length" if along is None else "both along and arc_length"
         raise ValueError(f"trace got {given}; give one of them, such as along={{'crank': values}}")
-    given = flat_with_known(measured), start, course, t
+    given = with_known_entries(measured), start, course, t
     with compiling(all_concrete(given) and is_first(trace, jax.tree.structure(given))):
         rows, result, freedom = _traced(*given)
     if along is None and (ways := concrete(freedom)) is not None and ways > 1:
@@ -250,7 +249,7 @@ def start_of(mechanism: Mechanism, start: State) -> State:
     return start
 
 
-@Program
+@scalarised
 def _traced(flat, start, course, t):
     """s, the places, the result, and in how many ways the mechanism can move."""
     system = system_of(flat, start.q.dtype)

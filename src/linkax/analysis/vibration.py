@@ -24,9 +24,9 @@ from linkax.simulation.explain.diagnosis import massless_bodies
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time, marked
 from linkax.xla.arrays import Array
-from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, concrete
 from linkax.xla.undefined import nan_where
+from scalarjit import scalarised
 
 
 def linearise(
@@ -78,7 +78,7 @@ def linearise(
     return marked(mechanism, linearisation)
 
 
-@Program
+@scalarised
 def _rank(mechanism, state, t):
     """Number of independent constraints, drives included."""
     system = system_in(mechanism, state, t, False)
@@ -107,7 +107,7 @@ def _moving(mechanism, state, t, count, moves):
     return Moving.of(system, TangentSpace().prepared(system.dtype), t, state.q, v, count, moves)
 
 
-@Program
+@scalarised
 def _turns(mechanism, state, t, count):
     """Turns of a symmetry that the motion may go on along, (1, m)."""
     moving, _ = _moving(mechanism, state, t, count, True)
@@ -115,7 +115,7 @@ def _turns(mechanism, state, t, count):
     return jnp.where(jnp.all(jnp.isfinite(turns)), turns, 0.0)[None]
 
 
-@Program
+@scalarised
 def _linearise(mechanism, state, t, count, moves, turns) -> tuple[Linearisation, Steadiness, Int[Array, ""]]:
     """A `Linearisation`, its `Steadiness`, along the first of `turns`, (k, m), that has a steady motion, or the first.
 

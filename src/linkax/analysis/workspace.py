@@ -22,12 +22,11 @@ from linkax.simulation.read.kinematics import Kinematics
 from linkax.simulation.start.places import Places
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_time
-from linkax.straight_line.known import flat_with_known
 from linkax.tables import Rows, Table, numbers, printed_as
 from linkax.xla.arrays import Array
-from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete, is_first
 from linkax.xla.waiting import Progress, compiling
+from scalarjit import scalarised, with_known_entries
 
 TOGETHER = 256  # positions that are computed at once
 Grid = Mapping[Any, ArrayLike | Sequence[ArrayLike | Sequence[float]]]
@@ -103,7 +102,7 @@ def workspace(
     start, t = start_of(mechanism, start), jnp.asarray(checked_time(t, "t"))
     axes, rows = _axes(mechanism, along)
     measured, held, values = values_along(mechanism, rows)
-    given = flat_with_known(measured), start, held, values, t
+    given = with_known_entries(measured), start, held, values, t
     shape, values = tuple(len(entries) for _, entries in axes), np.asarray(values)
     way = given[0], held, t
     with Progress(len(values), "position", progress) as line:
@@ -233,7 +232,7 @@ def _way(flat, held, t):
     return Way(system, t, held, followed_drives(held, system.constraints))
 
 
-@Program
+@scalarised
 def _begin(flat, held, t, start, near):
     """Values of what is held at the start, near to others, and how the ways begin there."""
     way = _way(flat, held, t)
@@ -241,7 +240,7 @@ def _begin(flat, held, t, start, near):
     return own, way.start(start, own)
 
 
-@Program
+@scalarised
 def _step(flat, held, t, q, begin, end, *came):
     """Coordinates at values `end` from those at `begin`, how the way came there, and whether it did, of many pairs."""
     way = _way(flat, held, t)
@@ -253,7 +252,7 @@ def _step(flat, held, t, q, begin, end, *came):
     return jax.vmap(step)(q, begin, end, *came)
 
 
-@Program
+@scalarised
 def _distance(flat, held, t, q, values, *came):
     way = _way(flat, held, t)
 

@@ -27,7 +27,7 @@ def bound(system: System, internal: Float[Array, " n_s"] | None) -> System:
         stop = start + size_of(shapes_of(force.itself.states))
         forces.append(Bound(force.itself, internal[start:stop]) if stop > start else force)
         start = stop
-    return dataclasses.replace(system, forces=tuple(forces), known=None)
+    return dataclasses.replace(system, forces=tuple(forces))
 
 
 def internal_rates(motion: Motion) -> Float[jax.Array, " n_s"]:

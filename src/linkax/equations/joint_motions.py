@@ -14,9 +14,9 @@ from linkax.equations.tree_sums import expand_to_motions, sum_by_body
 from linkax.model.joints.joint import RelativeMotion
 from linkax.model.topology import JointGroup
 from linkax.spatial.screws import turn_rate
-from linkax.straight_line.whole_jacobian import whole_jacobian
 from linkax.xla.arrays import Array
 from linkax.xla.static_scatter import scatter_static
+from linkax.xla.whole_jacobian import whole_jacobian
 
 
 def joint_motions(

@@ -23,10 +23,10 @@ from linkax.model.terms import Term
 from linkax.spatial.rotations import rotate
 from linkax.spatial.screws import turn_rate
 from linkax.spatial.vectors import cross, dot
-from linkax.straight_line.whole_jacobian import whole_jacobian
 from linkax.xla.arrays import Array
 from linkax.xla.static_scatter import scatter_static
 from linkax.xla.tracing import jit_inline
+from linkax.xla.whole_jacobian import whole_jacobian
 
 
 class Motion(eqx.Module):

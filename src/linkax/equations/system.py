@@ -1,6 +1,5 @@
 """The numbers of a mechanism, stacked in the order of its bodies and joints."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -21,13 +20,12 @@ from linkax.model.mechanism import Mechanism, require_unchanged
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.spatial.vectors import largest
 from linkax.spatial.vectors import length as length_of
-from linkax.straight_line.known import KnowsEntries, flat_with_known
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import positive_or_one
-from linkax.xla.flat import Flat
+from scalarjit import Flat
 
 
-class System(KnowsEntries):
+class System(eqx.Module):
     """A mechanism as arrays: bodies in tree order (n_b), joints tree first, then cut (n_j).
 
     - `mass` [kg] (n_b,), `center_of_mass` [m] (n_b, 3), `inertia` about it [kg m²] (n_b, 3, 3),
@@ -88,20 +86,13 @@ class System(KnowsEntries):
 def system_of(mechanism: Mechanism | Flat[Mechanism], dtype: DTypeLike, fixed_scales: bool = True) -> System:
     """Stack the numbers of a mechanism in a floating-point type.
 
-    A program knows entries of these numbers as a `flat_with_known` mechanism has noted them, or else where they are not
-    traced.
-
     **Arguments:** `fixed_scales`: lengths that serve as scales have no derivative, since no motion depends on them;
     what is told in them does, such as the distance from a singular configuration.
     """
-    flat = mechanism if isinstance(mechanism, Flat) else flat_with_known(mechanism)
-    require_unchanged(flat.tree)
-    known = flat.noted.through(_stacked, flat.tree, np.dtype(dtype), fixed_scales)
-    return dataclasses.replace(_stacked(flat.tree, dtype, fixed_scales), known=known)
-
-
-def _stacked(mechanism, dtype, fixed_scales) -> System:
-    topology, joints = mechanism.topology, mechanism.joints
+    mechanism = mechanism.tree if isinstance(mechanism, Flat) else mechanism
+    require_unchanged(mechanism)
+    topology = mechanism.topology
+    joints: tuple[Any, ...] = mechanism.joints
 
     def stack(entries, shape):
         entries = [jnp.asarray(entry, dtype) for entry in entries]
@@ -121,7 +112,6 @@ def _stacked(mechanism, dtype, fixed_scales) -> System:
     slides = lambda along: bool(topology.slides[topology.column(along)])
     constraint_scales = [unit for each in mechanism.constraints for unit in each.row_scales(length, slides)]
     return System(
-        known=None,
         own_classes=mechanism.own_classes,
         topology=topology,
         mass=stack([body.mass for body in mechanism.bodies], ()),

@@ -16,7 +16,6 @@ from linkax.equations.loops import jacobian_entries, widest
 from linkax.equations.system import System
 from linkax.linalg.block_elimination import Blocks, in_fronts
 from linkax.model.topology import Topology
-from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.tracing import jit_inline
 
@@ -132,7 +131,6 @@ class AbstractFormulation(eqx.Module):
 
 
 @jit_inline
-@straight_line
 def _is_near(system, t, before, closed):
     """Whether coordinates close the loops, and are near those before."""
     moved = system.fastest(speeds(system.topology, closed, closed - before))

@@ -27,7 +27,6 @@ from linkax.linalg.block_elimination import Factors
 from linkax.linalg.least_multipliers import least_multipliers
 from linkax.linalg.while_falling import while_falling
 from linkax.spatial.vectors import largest
-from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array, ScalarLike
 from linkax.xla.derivatives import positive_or_one, ratio
 from linkax.xla.tracing import jit_inline
@@ -118,7 +117,7 @@ def _close_jvp(primals, tangents):
     return (q, v), _closed_tangent((method, system, t, q, v), *jax.tree.flatten(tangents[1:]))
 
 
-@straight_line
+@jit_inline
 def _closed_tangent(arguments, tangents, structure):
     method, system, t, q, v = arguments
     linear = linear_system(system, t, q)
@@ -140,7 +139,6 @@ def approach(
 
 
 @jit_inline
-@straight_line
 def _improved(arguments, before, small):
     """The state after a Newton step from q, as long as gaps fall, and the gap at q."""
     method, system, t, q, v = arguments
@@ -226,14 +224,12 @@ def _limit(function, powers, method, system, t, q, v):
 
 
 @jit_inline
-@straight_line
 def _acceleration_at(arguments, t, q) -> Value:
     found, gap = _evaluate_near(arguments, t, q)
     return Value((found.q, found.acceleration), found.split.distance, gap)
 
 
 @jit_inline
-@straight_line
 def _multipliers_at(arguments, t, q) -> Value:
     method, system, v = arguments
     found, gap = _evaluate_near(arguments, t, q)

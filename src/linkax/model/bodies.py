@@ -14,7 +14,6 @@ from linkax.model.numbers import (
     Matrix,
     Number,
     Vector,
-    like,
     listed,
     namespace,
     number,
@@ -27,7 +26,6 @@ from linkax.model.numbers import (
     zero_or_more,
 )
 from linkax.model.shapes import Shape, turned
-from linkax.straight_line.known import known_values
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.tracing import concrete
 
@@ -254,8 +252,7 @@ def inertia_tensor(inertia: Matrix, what: str) -> Float[Array, "3 3"]:
     diagonal = _depth(inertia) == 1
     tensor = number(inertia, (3,) if diagonal else (3, 3), what)
     if diagonal:
-        known = known_values(tensor)
-        tensor = like(tensor * np.eye(3), np.where(np.eye(3) == 1.0, 1.0 if known is None else known, 0.0))
+        tensor = tensor * np.eye(3)
     tensor = require(tensor, _is_symmetric, what, "it must be symmetric")
     moments = _principal_moments(tensor, diagonal)
     sizes = "" if concrete(moments) is None else f" {moments.tolist()}"

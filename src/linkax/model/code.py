@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from linkax.model.code_walk import Key, Maker, NotComparable, NotMadeAgain, Same, Walk, is_library
-from linkax.xla.descriptions import Undescribed, description
+from scalarjit.descriptions import Undescribed, description
 
 Tree = TypeVar("Tree")
 

@@ -34,7 +34,7 @@ from linkax.model.numbers import listed, read_only, require_bool
 from linkax.model.spanning_tree import SpanningTree, spanning_tree
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.tables import printed_as
-from linkax.xla.kept import kept_while_alive
+from scalarjit import kept_while_alive
 
 
 @printed_as(described)

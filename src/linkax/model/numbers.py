@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.spatial.rotations import COORDINATE_AXES
-from linkax.straight_line.known import known_values, remember
 from linkax.xla.arrays import Array, Scalar, can_change
 from linkax.xla.tracing import concrete, without_derivatives
 
@@ -95,7 +94,7 @@ def _in_double(entry: Any) -> Array:
     if isinstance(entry, jax.Array):
         return jnp.asarray(entry, dtype=float)
     if any(isinstance(part, jax.Array) for part in jax.tree.leaves(entry)):
-        return remember(jnp.stack([jnp.asarray(part, dtype=float) for part in entry]), _known_parts(entry))
+        return jnp.stack([jnp.asarray(part, dtype=float) for part in entry])
     return _unchanging(entry, np.dtype(float))
 
 
@@ -111,14 +110,6 @@ def read_only(tree: Tree) -> Tree:
     number = lambda leaf: np.asarray(leaf) if isinstance(leaf, float) else leaf
     fixed = lambda leaf: _unchanging(leaf, leaf.dtype) if can_change(leaf) else leaf
     return jax.tree.map(lambda leaf: fixed(number(leaf)), tree)
-
-
-def _known_parts(entry):
-    """The entries of nested lists that are not traced, NaN for the others."""
-    if isinstance(entry, list | tuple):
-        return np.array([_known_parts(part) for part in entry])
-    known = concrete(entry)
-    return np.full(np.shape(entry), np.nan) if known is None else known
 
 
 def converted(entry: Any, what: str, convert: Callable[[Any], Kind]) -> Kind:
@@ -190,7 +181,7 @@ def require(array: Array, condition: Callable[[Array], Any], what: str, remedy: 
     """
     met = condition(numbers_of(array))
     if concrete(met) is None:
-        return like(jnp.where(met, array, jnp.nan), array)
+        return jnp.where(met, array, jnp.nan)
     if not met:
         raise ValueError(f"{what} is {np.asarray(array).tolist()}; {remedy}")
     return array
@@ -200,12 +191,6 @@ def numbers_of(array: Array) -> Array:
     """The numbers of an array, without derivatives: NumPy's, but where they are not known."""
     constant = without_derivatives(array)
     return constant if concrete(constant) is None else np.asarray(constant)
-
-
-def like(array: Array, other: Array) -> Array:
-    """An array that is zero where another one is known to be."""
-    known = known_values(other)
-    return array if known is None else remember(array, np.where(known == 0.0, 0.0, np.nan))
 
 
 def positive(entry: Any, what: str, remedy: str = "it must be positive") -> Scalar:
@@ -228,7 +213,7 @@ def unit_axis(axis: Axis, what: str) -> Constant | Float[Array, "3"]:
     remedy = "its length is zero or infinite; give a nonzero vector of finite length"
     vector = require(number(axis, (3,), what), lambda entries: _is_length(_norm(entries)), what, remedy)
     unit = vector / _norm(vector)
-    return Constant(unit) if isinstance(vector, np.ndarray) else like(unit, vector)
+    return Constant(unit) if isinstance(vector, np.ndarray) else unit
 
 
 def _norm(vector: Array) -> Any:

@@ -11,9 +11,10 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from linkax.files import writable_folder
-from linkax.xla.kept_programs import FOUND, keep_in
 from linkax.xla.memory_maps import COMPILING
 from linkax.xla.users_line import warn
+from scalarjit import keep_in
+from scalarjit.kept_programs import FOUND
 
 ASKED = "/jax/compilation_cache/compile_requests_use_cache"  # what JAX tells its listeners of a program
 FOUND_OR_KEPT = (FOUND, "/jax/compilation_cache/cache_misses")
@@ -48,7 +49,7 @@ def cache_programs(folder: str | os.PathLike | None = None) -> str:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     compilation_cache.reset_cache()  # which JAX opens when it compiles first
-    keep_in(None if "://" in path else Path(path).absolute())
+    keep_in(None if "://" in path else Path(path).absolute() / "linkax")
     _listen()
     return path
 

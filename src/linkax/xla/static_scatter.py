@@ -1,7 +1,6 @@
 """Writing to indices that are known when a program is compiled.
 
-Each entry of the result reads where it comes from. XLA's scatter, which writes, takes a step for each value on a CPU,
-and cannot be part of a larger kernel there (see `linkax.xla.flags`).
+Each entry of the result reads where it comes from. XLA's scatter, which writes, takes a step for each value on a CPU.
 """
 
 import jax.numpy as jnp

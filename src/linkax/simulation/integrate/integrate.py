@@ -32,11 +32,10 @@ from linkax.simulation.start.initial_state import InitialCheck, check_initial_st
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import sound_numbers
 from linkax.xla.arrays import Array
-from linkax.xla.flat import Flat
-from linkax.xla.program import Program, runs_often
 from linkax.xla.tracing import all_concrete, concrete, is_first
 from linkax.xla.undefined import infinite_where, undefined_where
 from linkax.xla.waiting import compiling
+from scalarjit import Flat, scalarised
 
 
 class Outcome(NamedTuple):
@@ -75,7 +74,7 @@ def _closing(run, initial, integrated):
     return run.flat, run.formulation, run.accuracy, initial, *given
 
 
-@Program
+@scalarised
 def _check_start(flat, state, t0, tangent_space) -> InitialCheck:
     system = system_of(flat, state.q.dtype)
     return check_initial_state(tangent_space.prepared(system.dtype), system, t0, state)
@@ -94,7 +93,7 @@ def problem_of(
     return Problem(flat.tree, system, formulation.prepared(dtype, initial.rank), accuracy, *start)
 
 
-@runs_often
+@scalarised
 def _integrate(run: Run, initial: InitialCheck) -> Integrated:
     dtype = initial.state.q.dtype
     formulation, t0, t1, options, control = cast((run.formulation, run.t0, run.t1, run.options, run.control), dtype)
@@ -237,7 +236,7 @@ class Reached(NamedTuple):
     result: Any
 
 
-@runs_often
+@scalarised
 def _closed(
     flat, formulation, accuracy, initial, reached, values, saves, firsts
 ) -> tuple[Reached, State, State | None]:

@@ -24,7 +24,6 @@ from linkax.simulation.integrate.diffrax_contract import integral_of_distance, p
 from linkax.simulation.integrate.impacts import has_ended, impacts_of
 from linkax.simulation.integrate.switches import Sides, are_apart, held, turning, values
 from linkax.simulation.start.state import State
-from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 from linkax.xla.tracing import jit_inline
@@ -133,7 +132,6 @@ class Problem(eqx.Module):
         return of_motion if of_internal is None else (*of_motion, of_internal)
 
     @jit_inline
-    @straight_line
     def derivative(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, " n"]:
         """ẏ = (0, q̇, v̇, ṡ, d) at (t, y), ṡ of internal states."""
         correct = self.accuracy.projection in ("both", "stage") and t != self.closed_at
@@ -146,7 +144,6 @@ class Problem(eqx.Module):
         return pack(still, rates(system.topology, q, v), acceleration, changes, distance)
 
     @jit_inline
-    @straight_line
     def corrected(
         self, t: Float[Array, ""], y: Float[Array, " n"], error: Float[Array, " n"] | None = None
     ) -> tuple[Float[Array, " n"], Errors | None, Float[Array, ""]]:
@@ -158,14 +155,12 @@ class Problem(eqx.Module):
         return pack(self.sides(y), q, v, self.internal(y), integral_of_distance(y)), errors, distance
 
     @jit_inline
-    @straight_line
     def opens(self, t: Float[Array, ""], y: Float[Array, " n"]) -> Float[Array, ""]:
         """The largest gap of the loops at a vector [rad, lengths of the mechanism]."""
         q = on_manifold(self.system.topology, self.unpacked(y)[0])
         return widest(configure(self.system, t, q))
 
     @jit_inline
-    @straight_line
     def drives_on(self, t: Float[Array, ""], y: Float[Array, " n"], ahead: Float[Array, ""]) -> Float[Array, ""]:
         """How long drives would take at their speeds so far to go as far as they go in a time ahead [s]."""
         q, _ = self.unpacked(y)

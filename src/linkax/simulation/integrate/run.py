@@ -33,10 +33,9 @@ from linkax.simulation.integrate.options import (
 from linkax.simulation.integrate.step_control import MechanismControl
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import checked_state, checked_time
-from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array, ScalarLike
-from linkax.xla.flat import Flat
 from linkax.xla.tracing import all_concrete, concrete
+from scalarjit import Flat, with_known_entries
 
 DEFAULT_FORMULATION = TangentSpace()
 DEFAULT_MAX_STEPS = 16**4
@@ -104,7 +103,7 @@ class Run(eqx.Module):
                 f"{stops[0].display_name} needs steps that end where an impact happens, and stepsize_controller is "
                 f"{options.controller!r}; leave it out, or give a linkax.JointLimit or Contact in place of the impact"
             )
-        flat, state, t0, accuracy = cast((flat_with_known(mechanism), state, t0, accuracy), dtype)
+        flat, state, t0, accuracy = cast((with_known_entries(mechanism), state, t0, accuracy), dtype)
         return Run(flat, state, t0, t1, formulation, accuracy, saves_times(options.saveat), Flat.of(options))
 
     @staticmethod
@@ -112,7 +111,7 @@ class Run(eqx.Module):
         mechanism: Mechanism, state: State, t: ScalarLike, formulation: AbstractFormulation, accuracy: Accuracy
     ) -> "Run":
         """What a state alone says of a run: nothing is stepped."""
-        return Run(flat_with_known(mechanism), state, t, t, formulation, accuracy, False, None)
+        return Run(with_known_entries(mechanism), state, t, t, formulation, accuracy, False, None)
 
     @property
     def mechanism(self) -> Mechanism:

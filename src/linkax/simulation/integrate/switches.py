@@ -64,7 +64,7 @@ def held(system: System, sides: Sides) -> System:
     """Hold the force elements of a system on the given sides of their switches."""
     each = iter(sides)
     forces = tuple(Held(force, next(each)) if force.has_switch else force for force in system.forces)
-    return dataclasses.replace(system, forces=forces, known=None)
+    return dataclasses.replace(system, forces=forces)
 
 
 def values(
@@ -217,7 +217,7 @@ def _sensitivity(problem, t0, t1, y0, y1, at_end):
         either = lambda number: jnp.asarray(PROBE * random.choice([-1.0, 1.0], np.shape(number)), number.dtype)
         other = lambda leaf: leaf * (1.0 + either(leaf)) if eqx.is_inexact_array(leaf) else leaf
         forces = jax.tree.map(other, system.forces)
-        near = dataclasses.replace(system, forces=forces, known=None)
+        near = dataclasses.replace(system, forces=forces)
         near = near if internal is None else bound(near, other(internal))
         turned = either(v) * system.scales
         return values(near, other(t1), retract(system.topology, q, turned), v + system.fastest(v) * turned)

@@ -19,7 +19,7 @@ from linkax.simulation.explain.error_estimate import has_parts, num_saves, part_
 from linkax.simulation.integrate.results import ENDED_WELL, SimulationError, Solution, result_name
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
-from linkax.xla.program import Program
+from scalarjit import scalarised
 
 REFINEMENTS = 6
 POLISHES = 2
@@ -287,7 +287,7 @@ def _on_cubic(system, ts, qs, vs, place):
     return hermite.evaluate(place)
 
 
-@Program
+@scalarised
 def sizes(
     mechanism: Mechanism, ts: Float[Array, " n"], qs: Float[Array, "n n_q"], vs: Float[Array, "n n_v"]
 ) -> tuple[Float[Array, " n-2"], Float[Array, " n"]]:
@@ -303,7 +303,7 @@ def sizes(
     return size(jax.vmap(off)(qs[1:-1], *ends, places)), size(vs)
 
 
-@Program
+@scalarised
 def between_states(
     mechanism: Mechanism,
     tangent_space: TangentSpace,

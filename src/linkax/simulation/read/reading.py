@@ -21,16 +21,11 @@ from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.results import Solution
 from linkax.simulation.read.observables import Observables
 from linkax.simulation.start.state import State
-from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
-from linkax.xla.flat import Flat
-from linkax.xla.kept import kept_while_alive
-from linkax.xla.program import Program, runs_often
 from linkax.xla.tracing import all_concrete, is_first
 from linkax.xla.undefined import infinite_where
 from linkax.xla.waiting import compiling
-
-FEW = 1.5e7  # times of all members, times the square of unknowns: reading more, or beams, takes longer than compiling
+from scalarjit import Flat, kept_while_alive, scalarised
 
 
 def read_in_motion(function: Callable[..., Any], solution: Solution, *details: Any) -> Any:
@@ -40,10 +35,10 @@ def read_in_motion(function: Callable[..., Any], solution: Solution, *details: A
     flat = solution.run.flat
     if solution.q is not None and all_concrete(solution) and is_first(function, flat.tree.topology, flat.noted):
         with compiling(), ThreadPoolExecutor() as threads:
-            program, *given = _asked(solution, Observables.solve, (), ())
-            threads.submit(program.lower(*given).compile)
-            program, *given = _asked(solution, function, program.blank_result(*given), details)
-            threads.submit(program.lower(*given).compile)
+            given = _asked(solution, Observables.solve, (), ())
+            threads.submit(_of_times.lower(*given).compile)
+            given = _asked(solution, function, _of_times.blank_result(*given), details)
+            threads.submit(_of_times.lower(*given).compile)
     return read(function, solution, *details, dynamics=read(Observables.solve, solution))
 
 
@@ -53,20 +48,18 @@ def read(function: Callable[..., Any], solution: Solution, *details: Any, dynami
         raise ValueError("this solution saved functions of its own in ys; simulate without SaveAt(fn=...)")
 
     def compute():
-        program, *given = _asked(solution, function, dynamics, details)
-        return program(*given)
+        return _of_times(*_asked(solution, function, dynamics, details))
 
     named = all(isinstance(detail, str | int) for detail in details)
     return kept(solution, (function, *details), compute) if named else compute()
 
 
 def _asked(solution, function, dynamics, details):
-    """The program that reads, and its arguments."""
-    topology, run = solution.mechanism.topology, solution.run
-    few = solution.ts.size * (topology.num_speeds + topology.num_rows) ** 2 <= FEW and not solution.mechanism.beams
+    """The arguments of the program that reads."""
+    run = solution.run
     states = solution.ts, solution.q, solution.v, solution.internal
     motion = SavedMotion(run.flat, run.formulation, run.tangent_space, solution.rank_nearby, *states)
-    return _of_few if few else _of_many, function, motion, dynamics, details
+    return function, motion, dynamics, details
 
 
 class SavedMotion(NamedTuple):
@@ -98,6 +91,7 @@ def _found(solution):
     return {}
 
 
+@scalarised
 def _of_times(function, motion: SavedMotion, dynamics, details):
     def of_member(motion, dynamics, details):
         dtype = motion.q.dtype
@@ -111,16 +105,13 @@ def _of_times(function, motion: SavedMotion, dynamics, details):
             (internal,), dynamics = (others[:1], others[1:]) if states else ((None,), others)
             found = Dynamics(*dynamics) if dynamics else None
             at = Observables(bound(system, internal), method, tangent_space, t, q, v, found, internal)
-            return straight_line(function)(at, *details)
+            return function(at, *details)
 
         return map_saved_times(of_time, jnp.isfinite(motion.ts), motion.ts, motion.q, motion.v, *states, *dynamics)
 
     for _ in range(motion.ts.ndim - 1):
         of_member = eqx.filter_vmap(of_member)
     return of_member(motion, dynamics, details)
-
-
-_of_few, _of_many = Program(_of_times), runs_often(_of_times)
 
 
 @eqx.filter_jit

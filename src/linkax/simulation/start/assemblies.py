@@ -23,11 +23,10 @@ from linkax.simulation.start.places import Places
 from linkax.simulation.start.rough_start import anywhere, beside, given_in_tree, unwound
 from linkax.simulation.start.state import State
 from linkax.simulation.start.validation import WorldPlaces, check_mechanism, checked_time, coordinates_by_joint
-from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array
-from linkax.xla.program import Program
 from linkax.xla.tracing import all_concrete
 from linkax.xla.users_line import warn
+from scalarjit import scalarised, with_known_entries
 
 SAME = 1e-6  # of the mechanism's length, or radians
 NOTHING = JointValues((), ())
@@ -74,7 +73,7 @@ def assemblies(
     if not all_concrete((mechanism, held, t)):
         raise ValueError("assemblies of numbers that JAX traces; their count must be known, so call it outside of jit")
     numbers = anywhere(tries, mechanism.topology.num_speeds, seed)
-    found = jax.tree.map(np.asarray, _assemblies(flat_with_known(measured), held, numbers, t))
+    found = jax.tree.map(np.asarray, _assemblies(with_known_entries(measured), held, numbers, t))
     isolated = found.met & (found.freedoms <= 0)
     distinct = [index for index in np.flatnonzero(isolated).tolist() if found.is_new(index)]
     if np.any(moving := found.met & ~isolated):
@@ -108,7 +107,7 @@ class _Found(NamedTuple):
         return not np.any(np.max(np.abs(earlier - self.places[index]), axis=1, initial=0.0) <= SAME)
 
 
-@Program
+@scalarised
 def _assemblies(flat, positions, numbers, t):
     demand, begin = demand_of(flat, positions, NOTHING, t)
     system, topology = demand.system, demand.system.topology

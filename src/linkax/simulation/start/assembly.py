@@ -33,14 +33,13 @@ from linkax.simulation.start.validation import (
     sound_numbers,
     speeds_by_joint,
 )
-from linkax.straight_line.known import flat_with_known
 from linkax.xla.arrays import Array
-from linkax.xla.program import Program
 from linkax.xla.static_scatter import scatter_static
 from linkax.xla.tracing import all_concrete, is_first, jit_inline, without_derivatives
 from linkax.xla.undefined import undefined_where
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import compiling
+from scalarjit import scalarised, with_known_entries
 
 
 class AssemblyError(ValueError):
@@ -106,7 +105,7 @@ def assemble(
     measured = places.measured()
     held, begin = (coordinates_by_joint(measured, *given) for given in ((positions, "position"), (guess, "guess")))
     moving = speeds_by_joint(measured, speeds, "speed")
-    given = flat_with_known(measured), held, moving, begin, t
+    given = with_known_entries(measured), held, moving, begin, t
     with compiling(all_concrete(given) and is_first(assemble, jax.tree.structure(given))):
         state, remainder = _assembled(*given)
     # Without the joints that only measured.
@@ -175,7 +174,7 @@ def _on_any_branch(given, state, remainder):
     return dataclasses.replace(state, v=v), dataclasses.replace(remainder, off_branch=jnp.zeros_like(sizes[0]))
 
 
-@Program
+@scalarised
 def _assemble(flat, positions, speeds, guess, t, *, branches):
     demand, begin = demand_of(flat, positions, guess, t)
     if (rough := guess.of_cuts()).groups:

@@ -1,6 +1,5 @@
 """Speeds that the loops allow, with some of them held; in a singular configuration on a branch of the motion."""
 
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,11 +21,10 @@ from linkax.simulation.start.initial_state import ON_BRANCH
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import nearest_solution, rank_tolerance
 from linkax.spatial.vectors import largest
-from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import materialise, positive_or_one, pushforward, ratio
-from linkax.xla.program import Program
-from linkax.xla.tracing import without_derivatives
+from linkax.xla.tracing import jit_inline, without_derivatives
+from scalarjit import scalarised
 
 TURNS = 30  # of Newton's method: from close to where y² = x² is flat, each but halves the way
 BESIDE = 1e-2
@@ -101,7 +99,7 @@ def _on_branch(asked, v):
     return lax.fori_loop(0, TURNS, lambda _, v: _turn(asked, v), v + jnp.where(off, beside, 0.0))
 
 
-@partial(straight_line, most=MOST_AT_ONCE)
+@jit_inline
 def _turn(asked, v):
     return v + nearest_solution(asked.system, jnp.zeros_like(v), asked.slopes(v), asked.rest(v))
 
@@ -138,7 +136,7 @@ class FoundSpeeds(NamedTuple):
     undecided: Bool[Array, ""]
 
 
-@partial(straight_line, most=MOST_AT_ONCE)
+@jit_inline
 def smallest_speeds(configuration: Configuration, held: JointValues) -> FoundSpeeds:
     """Find the smallest speeds with those of some joints held: where the rank of J is constant, all lie on a branch."""
     asked = _asked(configuration, held)
@@ -148,7 +146,7 @@ def smallest_speeds(configuration: Configuration, held: JointValues) -> FoundSpe
     return _found(asked, held, v, v, off[0], (largest(asked.right) > 0.0) & jnp.logical_not(on_branch))
 
 
-@partial(straight_line, most=MOST_AT_ONCE)
+@jit_inline
 def speeds_on_branch(configuration: Configuration, held: JointValues) -> FoundSpeeds:
     """Find the smallest speeds with those of some joints held, or, near them, speeds on a branch of the motion.
 
@@ -161,7 +159,7 @@ def speeds_on_branch(configuration: Configuration, held: JointValues) -> FoundSp
     return _found(asked, held, least, v, asked.off_branch(v), undecided)
 
 
-@straight_line
+@jit_inline
 def speeds_again(
     configuration: Configuration, held: JointValues, v: Float[Array, " n_v"], branches: bool
 ) -> Float[Array, " n_v"]:
@@ -181,7 +179,7 @@ def _found(asked, held, least, v, off_branch, undecided):
     return FoundSpeeds(given, misses, jnp.maximum(off_branch, asked.missed(v)), undecided)
 
 
-@Program
+@scalarised
 def other_speeds(
     mechanism: Mechanism, held: JointValues, t: Float[Array, ""], q: Float[Array, " n_q"], v: Float[Array, " n_v"]
 ) -> tuple[Float[Array, "k n_v"], Bool[Array, " k"]]:

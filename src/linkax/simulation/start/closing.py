@@ -15,10 +15,10 @@ from linkax.equations.system import System
 from linkax.linalg.while_falling import while_falling
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import elastic_energy, nearest_solution, nearest_solution_in, strains_of
-from linkax.straight_line.transform import straight_line
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import pushforward, ratio
 from linkax.xla.static_scatter import scatter_static
+from linkax.xla.tracing import jit_inline
 
 MOST_STEPS = 100
 # Share of what is open that a step closes at least: a hundred of less do not close it, and loops that cannot be closed
@@ -47,7 +47,7 @@ class LoopClosure(eqx.Module):
             [residual(configuration), flips(configuration)[0], self.held.apart(configuration).flat()]
         )
 
-    @straight_line
+    @jit_inline
     def linearised(self, q: Float[Array, " n_q"]) -> tuple[Float[Array, " n"], Float[Array, "n n_v"]]:
         """The residuals and their derivative where the loops are closed; elsewhere the direction that closes them."""
         topology, configuration = self.system.topology, configure(self.system, self.t, q)
@@ -59,17 +59,17 @@ class LoopClosure(eqx.Module):
             slopes = jnp.where(topology.slips[:, None], 0.0, slopes)
         return self.rows(configuration), jnp.concatenate([slopes, flips(close_loops)[1], held])
 
-    @straight_line
+    @jit_inline
     def rows_at(self, q: Float[Array, " n_q"]) -> Float[Array, " n"]:
         """All residuals at coordinates."""
         return self.rows(configure(self.system, self.t, q))
 
-    @straight_line
+    @jit_inline
     def size(self, q: Float[Array, " n_q"]) -> Float[Array, ""]:
         """The size of all residuals."""
         return _size(self.rows(configure(self.system, self.t, q)))
 
-    @straight_line
+    @jit_inline
     def newton(
         self, rows: Float[Array, " n"], slopes: Float[Array, "n n_v"], back: Float[Array, " n_v"]
     ) -> Float[Array, " n_v"]:
@@ -201,7 +201,7 @@ def _closed_jvp(primals, tangents):
     return q, _closed_tangent(demand, begin, q, *jax.tree.flatten(tangents[:2]))
 
 
-@straight_line
+@jit_inline
 def _closed_tangent(demand, begin, q, tangents, structure):
     topology, (change, begins) = demand.system.topology, jax.tree.unflatten(structure, tangents)
     along = jnp.zeros_like(demand.system.scales) if begins is None else speeds(topology, begin, begins)

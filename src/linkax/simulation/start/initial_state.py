@@ -1,6 +1,5 @@
 """The check of a state before motion starts: closed, on a branch of the motion, unique."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -20,12 +19,10 @@ from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.start.state import State
 from linkax.spatial.vectors import largest
-from linkax.straight_line.transform import MOST_AT_ONCE, straight_line
 from linkax.xla.arrays import Array, Scalar
 from linkax.xla.derivatives import ratio
-from linkax.xla.flat import Flat
-from linkax.xla.program import Program
-from linkax.xla.tracing import without_derivatives
+from linkax.xla.tracing import jit_inline, without_derivatives
+from scalarjit import Flat, scalarised
 
 MOVES = 1e-6  # of the largest speed
 SINGULAR_ULPS = 8.0  # times the number of speeds: what rounding leaves of a singular mass matrix
@@ -88,7 +85,7 @@ class OffLoops(NamedTuple):
         return (self.gap <= self.most) & (self.miss <= self.most)
 
 
-@Program
+@scalarised
 def off_loops(flat: Flat[Mechanism], t: Float[Array, ""], state: State) -> OffLoops:
     """How far a state at time t [s] is off the closed loops, in positions and in speeds."""
     system = system_of(flat, state.q.dtype)
@@ -152,7 +149,7 @@ class _AtStart(NamedTuple):
     on_branch: Bool[Array, ""]
 
 
-@partial(straight_line, most=MOST_AT_ONCE)
+@jit_inline
 def _at_start(method, system, t, q, v) -> _AtStart:
     split, mass, acceleration, definiteness = method.at_rest(system, t, q)
     rank = split.inverse.rank

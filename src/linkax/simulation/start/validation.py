@@ -22,9 +22,9 @@ from linkax.model.terms import TermLike, term
 from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
-from linkax.xla.kept import kept_while_alive
 from linkax.xla.tracing import concrete
 from linkax.xla.undefined import nan_where
+from scalarjit import kept_while_alive
 
 # What a user may give for joints, by their names, or by (name, index of a speed).
 JointNumbers = (

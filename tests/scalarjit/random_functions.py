@@ -9,7 +9,7 @@ SHAPES = ((), (3,), (4,), (3, 4), (2, 3, 3))
 OPERATIONS = 14
 
 
-class Program:
+class RandomFunction:
     """A random function of (scalar, vector, matrix), the same for the same seed; results in a list."""
 
     def __init__(self, seed):

@@ -8,26 +8,23 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from linkax.straight_line.transform import straight_line
-
 
 def whole_jacobian(function: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a function (static, *arrays) of few numbers: compute its Jacobian once, and contract it with each
     tangent.
 
-    Of a Jacobian with many columns, few of which concern this function, it then costs no more than its own. Both are
-    straight lines.
+    Of a Jacobian with many columns, few of which concern this function, it then costs no more than its own.
     """
 
     @partial(jax.custom_jvp, nondiff_argnums=(0,))
     def whole(static, *arrays):
-        return straight_line(partial(function, static))(*arrays)
+        return partial(function, static)(*arrays)
 
     def rule(static, arrays, tangents):
         moves = [type(change) is not jax.custom_derivatives.SymbolicZero for change in tangents]
         moving = lambda values: [value for value, of in zip(values, moves, strict=True) if of]
         at, restored = ravel_pytree(moving(arrays))
-        straight = straight_line(partial(function, static))
+        straight = partial(function, static)
 
         def of_moving(flat):
             moved = iter(restored(flat))

@@ -7,16 +7,19 @@ takes longer than a short run.
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
-import equinox as eqx
 import jax
+import numpy as np
 from jax.tree_util import register_pytree_node_class
-
-from linkax.xla.descriptions import description, of_each
 
 Tree = TypeVar("Tree")
 
 
-class _Structure:
+def is_array(leaf: Any) -> bool:
+    """Whether a leaf is an array of JAX or NumPy."""
+    return isinstance(leaf, jax.Array | np.ndarray | np.generic)
+
+
+class Structure:
     """What is static: the leaves that are no arrays, how they make a tree, what was noted; compared quickest first."""
 
     def __init__(self, others: tuple[Any, ...], treedef: Any, noted: Any) -> None:
@@ -30,15 +33,10 @@ class _Structure:
         return self._hash
 
     def __eq__(self, other: object) -> bool:
-        if self is other or not isinstance(other, _Structure):
+        if self is other or not isinstance(other, Structure):
             return self is other
         same = self._hash == other._hash and self.noted == other.noted
         return same and self.treedef == other.treedef and self.others == other.others
-
-
-@description.register
-def _(structure: _Structure) -> Any:
-    return "structure", *of_each((structure.others, structure.treedef, structure.noted))
 
 
 @register_pytree_node_class
@@ -48,15 +46,15 @@ class Flat(Generic[Tree]):
     `noted`: what is kept with it, static and hashable, whatever a transformation does to the arrays.
     """
 
-    def __init__(self, arrays: tuple[Any, ...], structure: _Structure) -> None:
+    def __init__(self, arrays: tuple[Any, ...], structure: Structure) -> None:
         self.arrays, self._structure = arrays, structure
 
     @staticmethod
     def of(tree: Tree, noted: Any = None) -> "Flat[Tree]":
         """All arrays of a tree, NumPy's too; other leaves are static, as to `equinox.filter_jit`."""
         leaves, treedef = jax.tree.flatten(tree)
-        others = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
-        return Flat(tuple(filter(eqx.is_array, leaves)), _Structure(others, treedef, noted))
+        others = tuple(None if is_array(leaf) else leaf for leaf in leaves)
+        return Flat(tuple(filter(is_array, leaves)), Structure(others, treedef, noted))
 
     @cached_property
     def tree(self) -> Tree:
@@ -71,12 +69,12 @@ class Flat(Generic[Tree]):
         """What was noted when it was made."""
         return self._structure.noted
 
-    def tree_flatten(self) -> tuple[tuple[Any, ...], _Structure]:
+    def tree_flatten(self) -> tuple[tuple[Any, ...], Structure]:
         """For JAX."""
         return self.arrays, self._structure
 
     @classmethod
-    def tree_unflatten(cls, structure: _Structure, arrays: Any) -> "Flat[Tree]":
+    def tree_unflatten(cls, structure: Structure, arrays: Any) -> "Flat[Tree]":
         """For JAX."""
         return cls(tuple(arrays), structure)
 

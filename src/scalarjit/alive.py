@@ -6,16 +6,15 @@ from functools import partial, wraps
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
 from jax.core import Tracer
-
-from linkax.xla.arrays import can_change
 
 Result = TypeVar("Result")
 
 
 def is_constant(leaf: Any) -> bool:
     """Whether this is neither traced by JAX nor an array of NumPy's that can be written to."""
-    return not isinstance(leaf, Tracer) and not can_change(leaf)
+    return not isinstance(leaf, Tracer) and not (isinstance(leaf, np.ndarray) and leaf.flags.writeable)
 
 
 def kept_while_alive(

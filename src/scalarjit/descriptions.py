@@ -23,10 +23,22 @@ from typing import Any
 import jax
 import numpy as np
 
-from linkax.xla.flags import makes_kernels_of_loops
+from scalarjit.flat import Structure
 
 # Packages that change with their version alone; linkax with its sources.
-PACKAGES = ("linkax", "jax", "jaxlib", "equinox", "diffrax", "lineax", "optimistix", "optax", "numpy", "scipy")
+PACKAGES = (
+    "linkax",
+    "scalarjit",
+    "jax",
+    "jaxlib",
+    "equinox",
+    "diffrax",
+    "lineax",
+    "optimistix",
+    "optax",
+    "numpy",
+    "scipy",
+)
 STANDARD = ("builtins", "functools", "operator", "math", "cmath", "collections", "typing", "types", "abc", "enum")
 # Names in users' functions by which these may read what is outside of them.
 _OUTSIDE = re.compile(
@@ -101,6 +113,11 @@ def _(value: np.ndarray | np.generic) -> Any:
 
 
 @description.register
+def _(structure: Structure) -> Any:
+    return "structure", *of_each((structure.others, structure.treedef, structure.noted))
+
+
+@description.register
 def _(value: tuple | list) -> Any:
     return named(type(value)), *of_each(value)
 
@@ -164,7 +181,7 @@ def _(value: types.CodeType) -> Any:
 @functools.cache
 def of_libraries() -> tuple[Any, ...]:
     """The versions of Python and all libraries, and the sources of linkax."""
-    versions = [(name, _version(name)) for name in PACKAGES[1:]]
+    versions = [(name, _version(name)) for name in PACKAGES[2:]]
     root = Path(__file__).parents[1]
     sources = [(path.relative_to(root).as_posix(), path.read_bytes()) for path in sorted(root.rglob("*.py"))]
     return sys.version, tuple(versions), hashlib.sha256(repr(sources).encode()).hexdigest()
@@ -200,4 +217,4 @@ def of_settings(given: tuple[Any, ...]) -> tuple[Any, ...]:
     """Those settings, the ones of XLA and Equinox, and the devices."""
     environment = [os.environ.get(name) for name in ("XLA_FLAGS", "EQX_ON_ERROR")]
     devices = [(device.platform, device.device_kind) for device in jax.devices()]
-    return _NAMES, tuple(map(repr, given)), environment, devices, makes_kernels_of_loops()
+    return _NAMES, tuple(map(repr, given)), environment, devices
