@@ -38,14 +38,17 @@ def ravelled(index: tuple[Number, ...], shape: tuple[int, ...]) -> Number:
 
 
 def unravelled(place: Number, shape: tuple[int, ...]) -> tuple[Number, ...]:
+    """The index of an entry by its place in memory; what is left is that of the first axis, as division takes long."""
     index: list[Number] = []
-    for size in reversed(shape):
+    for axis, size in reversed(list(enumerate(shape))):
         if size == 1:
             index.append(place * 0)
-            continue
-        rest = place // size
-        index.append(place - rest * size)
-        place = rest
+        elif math.prod(shape[:axis]) == 1:
+            index.append(place)
+        else:
+            rest = place // size
+            index.append(place - rest * size)
+            place = rest
     return tuple(reversed(index))
 
 

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from scalarjit.arrays import Entries, Number, Stored, are_known, by_entry, every, ravelled, unravelled
-from scalarjit.graph import INDEX, Buffer, Graph, Store, as_scalar, constant, number_of
+from scalarjit.graph import INDEX, Buffer, Graph, Store, as_scalar, constant, constants, number_of
 from scalarjit.rules.rule import MANY, SMALL, UNROLLED, has_entries, made, rule, written
 
 PASSES = 8  # of a sum in a loop that are written one by one
+FEW = 4  # entries of a row that may be nonzero, up to which a product leaves out the others
 
 
 def folded(graph: Graph, count: int, initial: int, term: Callable[[Number, Any], Any], unrolled: bool) -> Any:
@@ -188,6 +189,7 @@ def _dot(graph, name, out, arrays, *, dimension_numbers, **params):
         )
         other = is_right.transpose([*right_batch, *right_axes, *right_free]).reshape(len(in_order), count, -1)
         entries = int(np.sum(in_order @ other)) <= UNROLLED
+    few = None if entries else _least(_few_nonzero(left, left_axes), _few_nonzero(right, right_axes))
     if not entries:
         left, right = left.steady(), right.steady()
     num_batch, num_left = len(left_batch), len(left_free)
@@ -199,21 +201,47 @@ def _dot(graph, name, out, arrays, *, dimension_numbers, **params):
             index[num_batch + num_left :],
         )
 
-        def place(array, batch_axes, axes, free, of_free, along):
-            found: dict[int, Number] = dict(zip(batch_axes, batch, strict=True))
-            found |= dict(zip(axes, along, strict=True)) | dict(zip(free, of_free, strict=True))
+        rows = [
+            dict(zip(axes, batch, strict=True)) | dict(zip(free, of_free, strict=True))
+            for axes, free, of_free in ((left_batch, left_free, of_left), (right_batch, right_free, of_right))
+        ]
+
+        def entry(array, row, axes, along):
+            found = row | dict(zip(axes, along, strict=True))
             return array.at(tuple(found[axis] for axis in range(len(array.shape))))
 
         def term(number, found):
+            if few is not None:
+                of, places = few
+                row = [rows[of][axis] for axis in sorted(rows[of])]
+                number = number_of(graph, Entries(graph, constants(places), INDEX).at((*row, number)))
             along = unravelled(number, inner)
-            one = place(left, left_batch, left_axes, left_free, of_left, along)
-            other = place(right, right_batch, right_axes, right_free, of_right, along)
+            one = entry(left, rows[0], left_axes, along)
+            other = entry(right, rows[1], right_axes, along)
             product = graph.map("mul", *(graph.map(("convert", out.dtype), part) for part in (one, other)))
             return graph.map("add", found, product)
 
-        return folded(graph, count, constant(0, out.dtype), term, entries and are_known(index))
+        terms = count if few is None else few[1].shape[-1]
+        return folded(graph, terms, constant(0, out.dtype), term, entries and are_known(index))
 
     return made(graph, out.shape, out.dtype, element if entries else by_entry(element), entries=entries)
+
+
+def _few_nonzero(array, axes):
+    """For each row of an array the places along axes of its entries that may be nonzero, (..., k); None for many."""
+    if not has_entries(array):
+        return None
+    last = range(-len(axes), 0)
+    may_be = np.moveaxis(_may_be_nonzero(array), axes, last)
+    may_be = may_be.reshape(*may_be.shape[: may_be.ndim - len(axes)], -1)
+    most = max(1, np.max(np.sum(may_be, axis=-1), initial=0))
+    return np.argsort(~may_be, axis=-1, kind="stable")[..., :most] if most <= FEW else None
+
+
+def _least(*places):
+    """Of two operands that with the fewest entries in a row, and their places; None where all have many."""
+    found = [(each.shape[-1], number) for number, each in enumerate(places) if each is not None]
+    return (min(found)[1], places[min(found)[1]]) if found else None
 
 
 def _may_be_nonzero(array):
