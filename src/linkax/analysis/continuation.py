@@ -27,6 +27,7 @@ from linkax.spatial.vectors import dot, largest, length
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import positive_or_one, ratio
 from linkax.xla.tracing import jit_inline
+from scalarjit import scalarised
 
 MOST_CORRECTIONS = 5
 CONVERGED = 1e-8  # correction after which the next one is rounding [rad, lengths of the mechanism]
@@ -307,7 +308,7 @@ def follow_values(
         met = length(demand.rows_at(found)) <= CLOSED  # up to which there are derivatives
         return way.place(close_loops(demand, found, found), asked, before), lax.stop_gradient(met)
 
-    places, met = jax.vmap(at)(found, asked, before)
+    places, met = jax.vmap(scalarised(at))(found, asked, before)
     return places, reached & (jnp.cumsum(~met) == 0)
 
 

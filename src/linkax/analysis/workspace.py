@@ -249,7 +249,7 @@ def _step(flat, held, t, q, begin, end, *came):
         there, came, reached = way.through(q, Before(*came), Piece.straight(begin, end), jnp.ones((), bool))
         return there, *came, reached
 
-    return jax.vmap(step)(q, begin, end, *came)
+    return jax.vmap(scalarised(step))(q, begin, end, *came)
 
 
 @scalarised
@@ -260,4 +260,4 @@ def _distance(flat, held, t, q, values, *came):
         still = jnp.zeros_like(values)
         return way.place(q, Asked(values, still, still), Before(*came)).distance
 
-    return jax.vmap(of)(q, values, *came)
+    return jax.vmap(scalarised(of))(q, values, *came)

@@ -130,4 +130,4 @@ def _assemblies(flat, positions, numbers, t):
         freedoms = jnp.sum(moves) - jnp.sum(rank) - len(topology.spinning)
         return _Found(q, smallest_speeds(configuration, NOTHING).v, met, freedoms, place)
 
-    return jax.vmap(one)(beside(demand, given_in_tree(topology, positions), numbers))
+    return jax.vmap(scalarised(one))(beside(demand, given_in_tree(topology, positions), numbers))

@@ -18,6 +18,7 @@ from linkax.simulation.start.joint_values import JointValues
 from linkax.simulation.start.nearest_solution import strains_of
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
+from scalarjit import scalarised
 
 STARTS = 24
 STEPS, LAST_STEPS = 60, 20
@@ -37,7 +38,7 @@ def rough_start(
     starts = jax.vmap(lambda aside: retract(system.topology, begin, aside))(
         beside(demand, given, anywhere(STARTS, len(given)))
     )
-    found, misses = jax.vmap(fit.descend)(starts)
+    found, misses = jax.vmap(scalarised(fit.descend))(starts)
     return unwound(demand, found[jnp.argmin(misses)], begin)
 
 
