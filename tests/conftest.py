@@ -37,7 +37,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from program_folder import forget_oldest, program_folder  # noqa: E402
 
 from linkax.xla import memory_maps  # noqa: E402
-from scalarjit import keep_in  # noqa: E402
+from scalarjit import keep_in, machine  # noqa: E402
+
+# Nor is code compiled again with more care where it runs often.
+if not AS_USERS_DO:
+    machine.OFTEN = sys.maxsize
 
 pytest_plugins = ["annotations", "processor_time", "slow_tests"]
 

@@ -1,6 +1,7 @@
 """Code that LLVM makes: again with more care, with the same bits, in memory that holds anything at first, in parts."""
 
 import time
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from agreement import agrees, numbers
 from jax import lax
 from test_control import FUNCTIONS
 
-from scalarjit import handlers, scalarised
+from scalarjit import handlers, machine, scalarised
 from scalarjit.machine import CARE, Compiled
 
 PATIENCE = 60.0  # seconds, where others work too
@@ -24,6 +25,8 @@ def test_what_runs_often_is_compiled_again_to_the_same_bits(monkeypatch):
         loaded.append(self)
 
     monkeypatch.setattr(Compiled, "load", load)
+    monkeypatch.setattr(machine, "OFTEN", 2000)
+    monkeypatch.setattr(machine, "_watched", weakref.WeakSet())  # no other function comes before
     function = scalarised(lambda x: lax.fori_loop(0, 100, lambda k, x: jnp.cos(x @ x.T / 3) + k / 7, x))
     x = numbers(3, 3)
     first = np.asarray(function(x))
