@@ -25,7 +25,7 @@ from linkax.simulation.integrate.step_control import OPENS, MechanismControl
 from linkax.simulation.integrate.switches import Sides, crossed, meet
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
-from linkax.xla.tracing import without_derivatives
+from linkax.xla.tracing import jit_inline, without_derivatives
 
 DIVERGES = 2.0  # rate at which changes grow from one iteration to the next
 STAGNATES = 0.9  # rate at which they no longer fall
@@ -186,6 +186,8 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
     def func(self, terms: Any, t0: Float[Array, ""], y0: Float[Array, " n"], args: Problem) -> Float[Array, " n"]:
         return self.solver.func(terms, t0, y0, args)
 
+    # diffrax traces its loop three times.
+    @jit_inline
     def step(
         self,
         terms: Any,
