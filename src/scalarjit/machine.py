@@ -107,17 +107,26 @@ def _end() -> None:
 def _improve() -> None:
     """Compile again what has been called often, the most often called first."""
     while not _stop.wait(PAUSE):
-        often = [made for made in list(_watched) if made.cell[1] > OFTEN]
-        if not often:
+        made = _called_often()
+        if made is None:
             continue
-        made = max(often, key=lambda made: made.cell[1])
-        _watched.discard(made)
         try:
             code = files.read(file_of(made.text, CARE)) or _compiled_beside(made.text)
         except (OSError, EOFError):  # no process may be started here, or it has ended
             return
         if not _stop.is_set():
             made.load(code)
+
+
+def _called_often() -> Compiled | None:
+    """What has been called most often, if it is often; it is watched no longer."""
+    with _lock:  # others may add to these meanwhile
+        often = [made for made in _watched if made.cell[1] > OFTEN]
+        if not often:
+            return None
+        made = max(often, key=lambda made: made.cell[1])
+        _watched.discard(made)
+        return made
 
 
 def _compiled_beside(text: str) -> bytes:
