@@ -42,6 +42,9 @@ from scalarjit.traced import (
 )
 
 FEW = 8  # equations of a function that is always computed in place
+# The same of what a primitive is made of, such as that by which loops of Equinox keep a row of an array: a call of it
+# would copy all rows, in each step of a run that keeps its steps.
+FEW_OF_A_PRIMITIVE = 32
 MOST_PASSES = 64  # of a scan that is written pass by pass
 MOST_EQUATIONS = 400  # of such a scan
 
@@ -107,7 +110,9 @@ class Walk:
             several = equation.primitive.multiple_results
             found = RULES[name](self.graph, name, outs if several else outs[0], inputs, **params)
             return list(found) if several else [found]
-        return self.call(by_implementation(equation), inputs)
+        closed = by_implementation(equation)
+        short = num_equations(closed.jaxpr) <= FEW_OF_A_PRIMITIVE
+        return self.closed(closed, inputs) if short else self.call(closed, inputs)
 
     def call(self, closed: ClosedJaxpr, inputs: list[Array]) -> list[Array]:
         """Compute a function in place where it is short, else call it."""

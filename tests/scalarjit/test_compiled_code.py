@@ -3,6 +3,7 @@
 import time
 import weakref
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,8 @@ from jax import lax
 from test_control import FUNCTIONS
 
 from scalarjit import handlers, machine, scalarised
+from scalarjit.functions import function_of
+from scalarjit.graph import Copy, For, If, While
 from scalarjit.machine import CARE, Compiled
 
 PATIENCE = 60.0  # seconds, where others work too
@@ -39,6 +42,35 @@ def test_what_runs_often_is_compiled_again_to_the_same_bits(monkeypatch):
     assert again(), f"none of level {CARE}"
     np.testing.assert_array_equal(function(x), first)
     np.testing.assert_array_equal(found, first)
+
+
+def copies_in_loops(region, inside=False):
+    """Copies of arrays in passes of loops of unknown length."""
+    found = [item for item in region.items if isinstance(item, Copy) and inside]
+    for item in region.items:
+        if isinstance(item, While):
+            found += copies_in_loops(item.region, True)
+        elif isinstance(item, For | If):
+            found += copies_in_loops(item.region, inside)
+    return found
+
+
+def test_rows_are_kept_in_place():
+    """Not by a copy of all rows in each pass."""
+
+    def function(x):
+        def body(carry):
+            number, x, rows = carry
+            return number + 1, jnp.sin(x) + 1, rows.at[number].set(x)
+
+        begin = 0, x, jnp.full((1000, 3), jnp.inf)
+        return eqxi.while_loop(lambda carry: carry[0] < 20, body, begin, kind="lax", buffers=lambda carry: carry[2])[2]
+
+    x = numbers(3)
+    agrees(function, x)
+    agrees(jax.vmap(function), numbers(11, 3))
+    copies = copies_in_loops(function_of(jax.make_jaxpr(function)(x), [None]).graph.root)
+    assert not [copy for copy in copies if copy.source.size > 3]
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)
