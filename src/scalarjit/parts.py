@@ -1,5 +1,6 @@
 """Functions of which XLA computes some operations: those that have no rule, and the loops and branches around these."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -20,16 +21,24 @@ _able: dict[int, tuple[Any, bool]] = {}
 def is_compilable(jaxpr: Jaxpr) -> bool:
     """Whether all that a function consists of has rules."""
     if id(jaxpr) not in _able:
-        _able[id(jaxpr)] = jaxpr, all(map(_has_rule, jaxpr.eqns))
+        # What a function hands on as it is stands in no equation.
+        _able[id(jaxpr)] = jaxpr, _have_scalars(jaxpr.invars, jaxpr.outvars) and all(map(_has_rule, jaxpr.eqns))
     return _able[id(jaxpr)][1]
 
 
+def _have_scalars(*atoms):
+    try:
+        for atom in itertools.chain(*atoms):
+            check(atom.aval)
+    except Unsupported:
+        return False
+    return True
+
+
 def _has_rule(equation):
-    if equation.effects:
+    if equation.effects or not _have_scalars(equation.invars, equation.outvars):
         return False
     try:
-        for var in (*equation.invars, *equation.outvars):
-            check(var.aval)
         name = equation.primitive.name
         if name in RULES or name in FACTORISATIONS:
             return True
