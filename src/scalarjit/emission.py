@@ -3,7 +3,7 @@
 A function has the signature (arguments..., results..., memory, cell): pointers to arrays, memory of its own and for
 what it calls, and its cell: [address of its code, number of calls, cells of what it calls...]. It calls by way of
 cells, so that better code can take a function's place while programs run, and so that its text is the same in each
-process.
+process. At the end of such a call stands which function it calls: `units` writes those in its place.
 
 In vectors each entry of an array takes as many places in memory as a vector has members, one after another. Constants
 in memory, and what follows from them alone, are the same for all members and stay scalars.
@@ -342,7 +342,7 @@ class _Emission(Instructions):
         cell = self.value(f"load ptr, ptr {slot}")
         code = self.value(f"load ptr, ptr {cell}")
         given = ", ".join(f"ptr {address}" for address in [*addresses, memory, cell])
-        self.line(f"call void {code}({given})")
+        self.line(f"call void {code}({given}) ; callee {self.callees.index(function)}")
 
 
 def memory_dtype(buffer: Buffer) -> np.dtype:

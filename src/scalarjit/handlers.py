@@ -11,7 +11,8 @@ from scalarjit import packing
 from scalarjit.compiler import digest, kept_or_compiled, loaded
 from scalarjit.emission import ALIGNMENT
 from scalarjit.function import Function
-from scalarjit.machine import Unit, compiled, unit
+from scalarjit.machine import compiled
+from scalarjit.units import Unit, unit
 
 HANDLER = """
 @cell = global ptr null

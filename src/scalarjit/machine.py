@@ -8,42 +8,17 @@ from typing import Any
 import numpy as np
 
 from scalarjit import files
-from scalarjit.compiler import Beside, digest, file_of, kept_or_compiled, loaded
-from scalarjit.emission import CALLEES, emitted
-from scalarjit.function import Function
+from scalarjit.compiler import Beside, file_of, kept_or_compiled, loaded
+from scalarjit.emission import CALLEES
+from scalarjit.units import SYMBOL, Unit
 
 OFTEN = 2000  # calls after which a function is compiled with care, and passes of loops in it
 PAUSE = 0.02  # between two looks at how often functions have been called [s]
 CARE = 1  # level of optimisation then
-SYMBOL = "scalars"
+# Characters of a function and all that it calls, up to which they are compiled together: a second or two.
+MOST_TOGETHER = 2_000_000
 
 _lock = threading.RLock()
-
-
-class Unit:
-    """Code of a function for a number of members at once, without addresses: another process may have it too.
-
-    - `callees`: what it calls, in the order of its cell; `memory`: bytes that it needs, with what it calls.
-    - `key`: what tells it from others, by its text and what it calls.
-    """
-
-    def __init__(self, text: str, own_memory: int, callees: "list[Unit]") -> None:
-        self.text, self.callees = text, callees
-        self.memory = own_memory + max((each.memory for each in callees), default=0)
-        self.key = digest(text, *(each.key for each in callees))
-
-
-_units: "weakref.WeakKeyDictionary[Function, dict[int, Unit]]" = weakref.WeakKeyDictionary()
-
-
-def unit(function: Function, lanes: int) -> Unit:
-    """Give the code of a function, which is written once."""
-    with _lock:
-        versions = _units.setdefault(function, {})
-        if lanes not in versions:
-            code = emitted(function, lanes, SYMBOL)
-            versions[lanes] = Unit(code.text, code.own_memory, [unit(each, lanes) for each in code.callees])
-        return versions[lanes]
 
 
 class Compiled:
@@ -53,7 +28,7 @@ class Compiled:
     """
 
     def __init__(self, unit: Unit) -> None:
-        self.text = unit.text
+        self.unit = unit
         self.callees = [compiled(each) for each in unit.callees]
         self.cell = np.zeros(CALLEES + len(self.callees), np.int64)
         self.cell[CALLEES:] = [each.cell.ctypes.data for each in self.callees]
@@ -105,26 +80,39 @@ def _end() -> None:
 
 
 def _improve() -> None:
-    """Compile again what has been called often, the most often called first."""
+    """Compile again what has been called often, with all that it calls if that is not too much."""
     while not _stop.wait(PAUSE):
         made = _called_often()
         if made is None:
             continue
+        together = made.unit.size <= MOST_TOGETHER
+        text = made.unit.together() if together else made.unit.text
+        keys = [part.key for part in made.unit.all_parts()] if together else []
         try:
-            code = files.read(file_of(made.text, CARE)) or _compiled_beside(made.text)
+            code = files.read(file_of(text, CARE)) or _compiled_beside(text)
         except (OSError, EOFError):  # no process may be started here, or it has ended
             return
-        if not _stop.is_set():
-            made.load(code)
+        if _stop.is_set():
+            return
+        made.load(code)
+        for part in map(_compiled.get, keys):  # which it calls no longer
+            if part is not None:
+                part.cell[1] = 0
 
 
 def _called_often() -> Compiled | None:
-    """What has been called most often, if it is often; it is watched no longer."""
+    """What has been called often: the largest that is compiled with all that it calls, else the one called most often.
+
+    It is watched no longer.
+    """
     with _lock:  # others may add to these meanwhile
         often = [made for made in _watched if made.cell[1] > OFTEN]
         if not often:
             return None
-        made = max(often, key=lambda made: made.cell[1])
+        together = [made for made in often if made.unit.size <= MOST_TOGETHER]
+        by_size = lambda made: made.unit.size
+        by_calls = lambda made: made.cell[1]
+        made = max(together, key=by_size) if together else max(often, key=by_calls)
         _watched.discard(made)
         return made
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from agreement import agrees, numbers
 from jax import lax
-from test_control import FUNCTIONS
+from test_control import FUNCTIONS, SHAPES
 
 from scalarjit import handlers, machine, scalarised
+from scalarjit.compiler import object_code
 from scalarjit.functions import function_of
 from scalarjit.graph import Copy, For, If, While
 from scalarjit.machine import CARE, Compiled
@@ -42,6 +43,23 @@ def test_what_runs_often_is_compiled_again_to_the_same_bits(monkeypatch):
     assert again(), f"none of level {CARE}"
     np.testing.assert_array_equal(function(x), first)
     np.testing.assert_array_equal(found, first)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_code_with_all_that_it_calls_has_the_same_bits(function, shape, monkeypatch):
+    """Alone and in vectors, with memory of its own that is on the stack, and that is too large for it."""
+    registered = set()
+    register = handlers.Handler.register
+    monkeypatch.setattr(handlers.Handler, "register", lambda self: registered.add(self.unit) or register(self))
+    alone, of_batch = jax.jit(scalarised(function)), jax.jit(jax.vmap(scalarised(function)))
+    members = 11 if len(shape) == 1 else 2
+    one, several = ([numbers(*more, *shape, seed=seed) for seed in (0, 1)] for more in ((), (members,)))
+    first = alone(*one), of_batch(*several)
+    assert len(registered) == 2
+    for unit in registered:
+        machine.compiled(unit).load(object_code(unit.together(), CARE))
+    jax.tree.map(np.testing.assert_array_equal, (alone(*one), of_batch(*several)), first)
 
 
 def copies_in_loops(region, inside=False):
@@ -104,6 +122,19 @@ def test_what_has_no_rule_is_left_to_xla_and_the_rest_is_not():
     loss = lambda function: lambda x: jnp.sum(function(x)[0] ** 2) + jnp.sum(function(x)[2])
     slopes = jax.jacfwd(loss(scalarised(in_parts)))(x)
     np.testing.assert_allclose(slopes, jax.jacfwd(loss(in_parts))(x), atol=1e-8)
+
+
+def test_what_is_handed_on_may_be_of_any_type():
+    """By branches and functions that compute nothing of it, or something of other arrays."""
+
+    def function(x):
+        number = lax.complex(x, x + 1)
+        handed = lax.cond(x[0] > 0.0, lambda number: (number, x), lambda number: (jnp.conj(number), 2 * x), number)
+        several = jax.jit(lambda number, x: (number, [jnp.sin(x + k) for k in range(20)]))(*handed)
+        return jnp.abs(several[0]) + jnp.angle(several[0]), several[1]
+
+    for x in numbers(3), -numbers(3):
+        agrees(function, x)
 
 
 def test_callbacks_are_left_to_xla():
