@@ -1,5 +1,7 @@
 """Code that LLVM makes: again with more care, with the same bits, in memory that holds anything at first, in parts."""
 
+import pickle
+import re
 import time
 import weakref
 
@@ -135,6 +137,14 @@ def test_what_is_handed_on_may_be_of_any_type():
 
     for x in numbers(3), -numbers(3):
         agrees(function, x)
+
+
+def test_arrays_of_another_process_are_not_left_to_xla():
+    """Whose types are equal to those of this one, and not the same."""
+    for dtype in np.float64, np.float32, np.int64, bool:
+        array = pickle.loads(pickle.dumps(np.ones(3, dtype)))
+        for function in scalarised(lambda x: x + 1), jax.vmap(scalarised(lambda x: x + 1)):
+            assert re.search(handlers.NAMES, jax.jit(function).lower(array).as_text())
 
 
 def test_callbacks_are_left_to_xla():
