@@ -18,6 +18,7 @@ from scalarjit import files
 
 # Blocks are long, and to schedule their operations takes most of the time: of 5 MB of text 36 s, and 3 s without.
 QUICK = ("-enable-misched=false", "-pre-RA-sched=fast")
+CARE = 1  # level of optimisation of what runs often
 LENGTH = struct.Struct("<q")
 _is_ready = False
 

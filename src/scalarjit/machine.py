@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from scalarjit import files
-from scalarjit.compiler import Beside, file_of, kept_or_compiled, loaded
+from scalarjit.compiler import CARE, Beside, file_of, kept_or_compiled, loaded
 from scalarjit.emission import CALLEES
 from scalarjit.units import SYMBOL, Unit
 
 OFTEN = 2000  # calls after which a function is compiled with care, and passes of loops in it
 PAUSE = 0.02  # between two looks at how often functions have been called [s]
-CARE = 1  # level of optimisation then
 # Characters of a function and all that it calls, up to which they are compiled together: a second or two.
 MOST_TOGETHER = 2_000_000
 
@@ -85,9 +84,8 @@ def _improve() -> None:
         made = _called_often()
         if made is None:
             continue
-        together = made.unit.size <= MOST_TOGETHER
+        together = _is_small(made)
         text = made.unit.together() if together else made.unit.text
-        keys = [part.key for part in made.unit.all_parts()] if together else []
         try:
             code = files.read(file_of(text, CARE)) or _compiled_beside(text)
         except (OSError, EOFError):  # no process may be started here, or it has ended
@@ -95,9 +93,8 @@ def _improve() -> None:
         if _stop.is_set():
             return
         made.load(code)
-        for part in map(_compiled.get, keys):  # which it calls no longer
-            if part is not None:
-                part.cell[1] = 0
+        for part in made.unit.all_parts() if together else ():  # which it calls no longer
+            _compiled[part.key].cell[1] = 0
 
 
 def _called_often() -> Compiled | None:
@@ -109,12 +106,16 @@ def _called_often() -> Compiled | None:
         often = [made for made in _watched if made.cell[1] > OFTEN]
         if not often:
             return None
-        together = [made for made in often if made.unit.size <= MOST_TOGETHER]
-        by_size = lambda made: made.unit.size
-        by_calls = lambda made: made.cell[1]
-        made = max(together, key=by_size) if together else max(often, key=by_calls)
+        together = filter(_is_small, often)
+        made = max(together, key=lambda made: made.unit.size, default=None)
+        made = made or max(often, key=lambda made: made.cell[1])
         _watched.discard(made)
         return made
+
+
+def _is_small(made):
+    """Whether it is compiled with all that it calls."""
+    return made.unit.size <= MOST_TOGETHER
 
 
 def _compiled_beside(text: str) -> bytes:

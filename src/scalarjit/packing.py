@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from scalarjit.compiler import kept_or_compiled, loaded
+from scalarjit.compiler import CARE, kept_or_compiled, loaded
 
-CARE = 1  # level of optimisation
 SIZES = (1, 2, 4, 8)  # of entries [bytes]
 FUNCTIONS = ("pack", "unpack")
 TEXT = """
