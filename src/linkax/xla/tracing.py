@@ -24,12 +24,6 @@ jit_inline = eqx.filter_jit
 KINDS = 256  # of programs that are known to have been compiled
 
 
-def is_compiled() -> bool:
-    """Whether JAX compiles at all, which `jax.disable_jit()` forbids."""
-    config: Any = jax.config
-    return not config.jax_disable_jit
-
-
 def concrete(number: Any) -> np.ndarray | None:
     """Return a number as a NumPy array, or None while a transformation traces it."""
     return None if isinstance(number, Tracer) else np.asarray(number)
