@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,13 +22,25 @@ import numpy as np
 from jax.experimental import serialize_executable
 from jax.stages import Compiled, Lowered
 
-from scalarjit import files, handlers
+from scalarjit import files
 from scalarjit.descriptions import description, of_libraries, of_processor, of_settings, settings
 from scalarjit.flat import Flat
+from scalarjit.transform import handlers
 
 FOUND = "/jax/compilation_cache/cache_hits"  # what JAX tells its listeners where it reads a program from its files
 _met: dict[Any, "KeptProgram | None"] = {}
 _thread = threading.local()
+
+
+def keep_in(folder: Path | None) -> None:
+    """Keep programs, and object code, in a folder from now on, or no longer."""
+    files.keep_in(folder)
+    of_libraries()  # while the sources are those that run
+
+
+def forget() -> None:
+    """Let go of programs, which are read again where they are asked for."""
+    _met.clear()
 
 
 def are_kept() -> bool:
@@ -109,7 +122,8 @@ def _new(place, lowered):
     if "callback" in text:  # to Python, of this process
         return None
     blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), lowered.out_info).tree
-    called = [handlers.registered[name] for name in sorted(set(re.findall(handlers.NAMES, text)))]
+    names = [] if handlers is None else sorted(set(re.findall(handlers.NAMES, text)))
+    called = [handlers.registered[name] for name in names]
 
     def compile():
         _listen()

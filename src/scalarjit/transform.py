@@ -20,9 +20,9 @@ from scalarjit.known import Pattern
 from scalarjit.parts import in_parts, is_compilable
 
 try:
-    from scalarjit.handlers import handler_of
+    from scalarjit import handlers
 except (ImportError, OSError) as error:
-    handler_of = None
+    handlers = None
     warnings.warn(
         f"scalarjit: functions are left to XLA, as llvmlite does not load: {error}", RuntimeWarning, stacklevel=2
     )
@@ -67,10 +67,10 @@ class Source:
     def handler(self, batch: Batch | None) -> str:
         """The name by which JAX calls it."""
         if batch not in self._handlers:
-            assert handler_of is not None
+            assert handlers is not None
             members, batched = batch or (None, ())
             lanes = min(LANES, 1 << ((members or 1) - 1).bit_length())
-            handler = handler_of(self.function, lanes, members, batched)
+            handler = handlers.handler_of(self.function, lanes, members, batched)
             handler.register()
             self._handlers[batch] = handler.name
         return self._handlers[batch]
@@ -169,7 +169,7 @@ def _lead(batch):
 
 def _called(*args, source, batch):
     """A call of compiled code among XLA's operations."""
-    if handler_of is None:
+    if handlers is None:
         return _as_it_stands(*args, source=source, batch=batch)
     if not is_compilable(source.jaxpr.jaxpr):
         return _of_members(in_parts(source.jaxpr, source.known, _bind_part), args, batch)

@@ -2,6 +2,8 @@
 
 import pickle
 import re
+import subprocess
+import sys
 import time
 import weakref
 
@@ -15,10 +17,10 @@ from jax import lax
 from test_control import FUNCTIONS, SHAPES
 
 from scalarjit import handlers, machine, scalarised
-from scalarjit.compiler import object_code
+from scalarjit.compiler import CARE, object_code
 from scalarjit.functions import function_of
 from scalarjit.graph import Copy, For, If, While
-from scalarjit.machine import CARE, Compiled
+from scalarjit.machine import Compiled
 
 PATIENCE = 60.0  # seconds, where others work too
 
@@ -145,6 +147,26 @@ def test_arrays_of_another_process_are_not_left_to_xla():
         array = pickle.loads(pickle.dumps(np.ones(3, dtype)))
         for function in scalarised(lambda x: x + 1), jax.vmap(scalarised(lambda x: x + 1)):
             assert re.search(handlers.NAMES, jax.jit(function).lower(array).as_text())
+
+
+WITHOUT_LLVM = """
+import sys, warnings
+sys.modules["llvmlite"] = None
+import numpy as np
+from pathlib import Path
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    import linkax
+    from scalarjit import keep_in, scalarised
+assert any("llvmlite does not load" in str(each.message) for each in told)
+keep_in(Path(sys.argv[1]))
+np.testing.assert_array_equal(scalarised(lambda x: x + 1.0)(np.ones(3)), 2.0)
+"""
+
+
+def test_without_llvm_all_is_left_to_xla_and_told(tmp_path):
+    subprocess.run([sys.executable, "-c", WITHOUT_LLVM, str(tmp_path)], check=True, timeout=120)
+    assert list(tmp_path.iterdir())
 
 
 def test_callbacks_are_left_to_xla():
