@@ -2,11 +2,13 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve
+from jax.scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve
 from jaxtyping import Float
 
 from linkax.formulations.classical import AbstractAcceleration
 from linkax.xla.arrays import Array
+
+ROUNDING = 10.0  # times n ε: what is left of a pivot, of the largest one, where rows depend on one another
 
 
 class LagrangeMultipliers(AbstractAcceleration):
@@ -30,9 +32,18 @@ class LagrangeMultipliers(AbstractAcceleration):
         m, n = jacobian.shape
         if self.block:
             matrix = jnp.block([[mass, -jacobian.T], [jacobian, jnp.zeros((m, m), mass.dtype)]])
-            solved = jnp.linalg.solve(matrix, jnp.concatenate([force, gamma]))
+            solved = _solved(matrix, jnp.concatenate([force, gamma]))
             return solved[:n], solved[n:]
         factor = cho_factor(mass)
         free, moved = cho_solve(factor, force), cho_solve(factor, jacobian.T)
-        multipliers = jnp.linalg.solve(jacobian @ moved, gamma - jacobian @ free)
+        multipliers = _solved(jacobian @ moved, gamma - jacobian @ free)
         return free + moved @ multipliers, multipliers
+
+
+def _solved(matrix, right):
+    """The solution by LU; not a number where the matrix is singular but for how its pivots are rounded."""
+    factor, pivots = lu_factor(matrix)
+    sizes = jnp.abs(jnp.diagonal(factor))
+    rounding = ROUNDING * len(matrix) * jnp.finfo(matrix.dtype).eps
+    is_regular = jnp.min(sizes, initial=jnp.inf) > rounding * jnp.max(sizes, initial=0.0)
+    return jnp.where(is_regular, lu_solve((factor, pivots), right), jnp.nan)
