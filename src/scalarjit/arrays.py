@@ -1,7 +1,7 @@
 """Arrays of scalars: entry by entry, in memory, or told by what their entries are."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -50,6 +50,20 @@ def unravelled(place: Number, shape: tuple[int, ...]) -> tuple[Number, ...]:
             index.append(place - rest * size)
             place = rest
     return tuple(reversed(index))
+
+
+def nested(
+    graph: Graph, shape: tuple[int, ...], carried: Sequence[int], body: Callable[..., Sequence[int]]
+) -> Sequence[int]:
+    """Loops over the indices of all entries, row by row: body(index, *carried) -> what is carried on."""
+    if not shape:
+        return body((), *carried)
+
+    def one(scalar, *carried):
+        number = number_of(graph, scalar)
+        return nested(graph, shape[1:], carried, lambda index, *carried: body((number, *index), *carried))
+
+    return graph.loop(shape[0], carried, one)
 
 
 def by_entry(element: Callable[[tuple[Number, ...]], int]) -> Callable[[tuple[Number, ...]], Any]:

@@ -5,10 +5,14 @@ what it calls, and its cell: [address of its code, number of calls, cells of wha
 cells, so that better code can take a function's place while programs run, and so that its text is the same in each
 process. At the end of such a call stands which function it calls: `units` writes those in its place.
 
+Loops that do many times what their text says are functions of a module of their own, which is compiled with care at
+once: they are most of the work of large functions, and little of their text.
+
 In vectors each entry of an array takes as many places in memory as a vector has members, one after another. Constants
 in memory, and what follows from them alone, are the same for all members and stay scalars.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -18,6 +22,7 @@ from scalarjit.function import Function
 from scalarjit.graph import BOOL, Buffer, Call, Copy, For, If, Region, Store, While, value_of
 from scalarjit.instructions import Instructions
 from scalarjit.operations import memory_type
+from scalarjit.weights import is_heavy, used_scalars
 from scalarjit.writer import literal, mangled
 
 ALIGNMENT = 64  # of arrays in memory, in bytes
@@ -26,31 +31,39 @@ CALLEES = 2  # entries of a cell before those of what the function calls
 
 @dataclass
 class Code:
-    """The text of a function, the functions that it calls, in the order of its cell, and the memory of its own."""
+    """The text of a function, that of its heavy loops, the functions that it calls, and the memory of its own.
+
+    - `callees`: in the order of its cell.
+    """
 
     text: str
+    loops: str
     callees: list[Function]
     own_memory: int
 
 
 def emitted(function: Function, lanes: int, symbol: str) -> Code:
     """Write a function for a number of members at once."""
-    return _Emission(function, lanes).code(symbol)
+    return _Emission(function, lanes, symbol).code()
 
 
 class _Emission(Instructions):
-    def __init__(self, function: Function, lanes: int) -> None:
+    def __init__(self, function: Function, lanes: int, symbol: str) -> None:
         super().__init__(function.graph, lanes)
         self.function = function
+        self.symbol = symbol
         self.mask: str | None = None  # members that take a branch, or go on
         self.places: dict[int, str] = {}
         self.constants: dict[int, tuple[Buffer, str]] = {}
         self.expanded: dict[int, Buffer] = {}  # constants as vectors
         self.callees: list[Function] = []
         self.own_memory = 0
-        self.used = _used(function)
+        self.used = used_scalars(function)
+        self.is_apart = False  # in a loop of a module of its own
+        self.loops: list[str] = []
+        self.loop_heads: list[str] = []
 
-    def code(self, symbol: str) -> Code:
+    def code(self) -> Code:
         function = self.function
         parameters = []
         for number, buffer in enumerate(function.passed):
@@ -63,18 +76,25 @@ class _Emission(Instructions):
         self.counts(1)
         self.region(function.graph.root)
         self.lines.append("ret void")
-        body = "\n".join(self.lines).replace("@OWN@", str(self.own_memory))
-        globals_ = "\n".join(
+        entry = f"""%counter = getelementptr i64, ptr %cell, i64 1
+%beyond = getelementptr i8, ptr %memory, i64 {self.own_memory}"""
+        body = "\n".join(self.lines)
+        own = f"define void @{self.symbol}({', '.join(parameters)}) nounwind {{\nentry:\n{entry}\n{body}\n}}\n"
+        text = self.module("\n".join([*self.loop_heads, own]), self.symbol)
+        loops = self.module("\n".join(self.loops), f"{self.symbol}.loops") if self.loops else ""
+        return Code(text, loops, self.callees, self.own_memory)
+
+    def module(self, functions: str, symbol: str) -> str:
+        """The text of functions, with what they need."""
+        named = set(re.findall(r"@c\d+(?=@)", functions))
+        constants = "\n".join(
             f"{name}.{symbol} = private constant [{buffer.size} x {memory_type(buffer.dtype)}] {_array(buffer)}"
             for buffer, name in self.constants.values()
+            if name in named
         )
-        for _, name in self.constants.values():
-            body = body.replace(f"{name}@", f"{name}.{symbol}")
-        counted = "%counter = getelementptr i64, ptr %cell, i64 1"
         declarations = "\n".join(sorted(self.declared))
-        head = f"define void @{symbol}({', '.join(parameters)}) nounwind {{\nentry:\n{counted}\n"
-        text = f"{globals_}\n{declarations}\n{head}{body}\n}}\n"
-        return Code(text, self.callees, self.own_memory)
+        functions = re.sub(r"(@c\d+)@", rf"\1.{symbol}", functions)
+        return f"{constants}\n{declarations}\n{functions}"
 
     # Memory.
 
@@ -88,11 +108,15 @@ class _Emission(Instructions):
             self.constants[id(buffer)] = buffer, name
             self.places[id(buffer)] = f"{name}@"
             return f"{name}@"
-        buffer_bytes = max(buffer.size, 1) * np.dtype(memory_dtype(buffer)).itemsize * self.lanes
-        offset = self.own_memory
-        self.own_memory += -(-buffer_bytes // ALIGNMENT) * ALIGNMENT
+        offset = self.room(max(buffer.size, 1) * np.dtype(memory_dtype(buffer)).itemsize)
         self.places[id(buffer)] = f"getelementptr:{offset}"
         return self.places[id(buffer)]
+
+    def room(self, size: int) -> int:
+        """Take as many bytes of own memory for each member, and give where they begin."""
+        offset = self.own_memory
+        self.own_memory += -(-size * self.lanes // ALIGNMENT) * ALIGNMENT
+        return offset
 
     def address(self, buffer: Buffer) -> str:
         place = self.place(buffer)
@@ -278,13 +302,59 @@ class _Emission(Instructions):
             self.operation(scalar)
 
     def for_(self, loop: For) -> None:
+        if not self.is_apart and is_heavy(loop, self.used):
+            self.apart(loop)
+        else:
+            self.within(loop)
+            self.counts(loop.count)
+
+    def within(self, loop: For) -> None:
         self.uniform.add(loop.index)
-        carried = [each for each in loop.carried if each[0] in self.used]
-        self.counted(loop.count, f"%v{loop.index}", lambda: self.region(loop.region), carried)
-        self.counts(loop.count)
+        self.counted(loop.count, f"%v{loop.index}", lambda: self.region(loop.region), self.carried(loop))
+
+    def carried(self, loop: For) -> list[tuple[int, int, int]]:
+        return [each for each in loop.carried if each[0] in self.used]
+
+    def apart(self, loop: For) -> None:
+        """Write a loop as a function, whose arguments are what it needs; what it carries it hands on in memory."""
+        outer_lines = self.lines
+        outer_block = self.block
+        self.lines = []
+        self.block = "entry"
+        self.is_apart = True
+        self.within(loop)
+        handed_on = []
+        for scalar, _, _ in self.carried(loop):
+            place = f"getelementptr i8, ptr %memory, i64 {self.room(8)}"
+            handed_on.append((scalar, place))
+            self.line(f"store {self.type(scalar)} %v{scalar}, ptr {self.value(place)}")
+        self.line("ret void")
+        body = "\n".join(["entry:", *self.lines])
+        self.is_apart = False
+        self.lines = outer_lines
+        self.block = outer_block
+        names = set(re.findall(r"%\w+", body)) - set(re.findall(r"^(%\w+) =", body, re.MULTILINE))
+        labels = {f"%{label}" for label in re.findall(r"^(\w+):", body, re.MULTILINE)}
+        given = [(self.type_of(name), name) for name in sorted(names - labels)]
+        name = f"@loop{len(self.loops)}.{self.symbol}"
+        types = ", ".join(kind for kind, _ in given)
+        parameters = ", ".join(f"{kind}{' noalias' if kind == 'ptr' else ''} {each}" for kind, each in given)
+        self.loop_heads.append(f"declare void {name}({types})")
+        self.loops.append(f"define void {name}({parameters}) nounwind {{\n{body}\n}}\n")
+        self.line(f"call void {name}({', '.join(' '.join(each) for each in given)})")
+        for scalar, place in handed_on:
+            self.line(f"%v{scalar} = load {self.type(scalar)}, ptr {self.value(place)}")
+
+    def type_of(self, name: str) -> str:
+        """The type of what stands outside of a loop."""
+        if name.startswith("%v"):
+            return self.type(int(name[2:]))
+        return self.vector("i1") if name == self.mask else "ptr"
 
     def counts(self, number: int) -> None:
-        """Count passes of loops as calls: what makes many of them is worth better code."""
+        """Count passes of loops as calls: what makes many of them is worth better code, but for those that have it."""
+        if self.is_apart:
+            return
         calls = self.value("load i64, ptr %counter")
         self.line(f"store i64 {self.value(f'add i64 {calls}, {number}')}, ptr %counter")
 
@@ -337,11 +407,10 @@ class _Emission(Instructions):
                 buffer = room
             addresses.append(self.address(buffer))
         addresses += [self.address(buffer) for buffer in call.results]
-        memory = self.value("getelementptr i8, ptr %memory, i64 @OWN@")
         slot = self.value(f"getelementptr ptr, ptr %cell, i64 {CALLEES + self.callees.index(function)}")
         cell = self.value(f"load ptr, ptr {slot}")
         code = self.value(f"load ptr, ptr {cell}")
-        given = ", ".join(f"ptr {address}" for address in [*addresses, memory, cell])
+        given = ", ".join(f"ptr {address}" for address in [*addresses, "%beyond", cell])
         self.line(f"call void {code}({given}) ; callee {self.callees.index(function)}")
 
 
@@ -359,38 +428,3 @@ def _array(buffer):
     if not np.any(data.view(f"u{data.itemsize}")):
         return "zeroinitializer"
     return "[" + ", ".join(f"{kind} {literal(value)}" for value in data) + "]"
-
-
-def _used(function: Function) -> set[int]:
-    """The scalars that results, memory, loops and branches need."""
-    graph = function.graph
-    used: set[int] = set()
-    loops: dict[int, tuple[int, int]] = {}
-    waiting: list[int] = []
-
-    def roots(region: Region) -> None:
-        for item in region.items:
-            if isinstance(item, Store):
-                waiting.extend((item.offset, item.value))
-            elif isinstance(item, For):
-                waiting.append(item.index)
-                for scalar, first, then in item.carried:
-                    loops[scalar] = first, then
-                roots(item.region)
-            elif isinstance(item, While):
-                waiting.append(item.goes_on)
-                roots(item.test)
-                roots(item.region)
-            elif isinstance(item, If):
-                waiting.append(item.condition)
-                roots(item.region)
-
-    roots(graph.root)
-    while waiting:
-        scalar = waiting.pop()
-        if scalar < 0 or scalar in used:
-            continue
-        used.add(scalar)
-        waiting.extend(graph.operands[scalar])
-        waiting.extend(loops.get(scalar, ()))
-    return used

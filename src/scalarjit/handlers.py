@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from scalarjit import packing
-from scalarjit.compiler import digest, kept_or_compiled, loaded
+from scalarjit.compiler import AT_ONCE, digest, kept_or_compiled, loaded
 from scalarjit.emission import ALIGNMENT
 from scalarjit.function import Function
 from scalarjit.machine import compiled
@@ -80,7 +80,7 @@ class Handler:
         if self.name in registered:
             return
         made = compiled(self.unit)
-        engine = loaded(kept_or_compiled(self.text, 0))
+        engine = loaded(kept_or_compiled(self.text, AT_ONCE))
         for name, address in ("cell", made.cell.ctypes.data), ("packing", packing.table(self.lanes, self.sizes)):
             ctypes.c_int64.from_address(engine.get_global_value_address(name)).value = address
         called = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(engine.get_function_address("handler"))

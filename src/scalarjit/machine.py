@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from scalarjit import files
-from scalarjit.compiler import CARE, Beside, file_of, kept_or_compiled, loaded
+from scalarjit.compiler import AT_ONCE, CARE, HEAVY_LOOPS, Beside, file_of, kept_or_compiled, loaded
 from scalarjit.emission import CALLEES
 from scalarjit.units import SYMBOL, Unit
 
 OFTEN = 2000  # calls after which a function is compiled with care, and passes of loops in it
 PAUSE = 0.02  # between two looks at how often functions have been called [s]
-# Characters of a function and all that it calls, up to which they are compiled together: a second or two.
-MOST_TOGETHER = 2_000_000
+# Characters of a function and all that it calls, up to which they are compiled again: a second or two. A crane runs no
+# faster where what is larger is compiled again by itself, heavy loops apart, which takes 140 s of a core.
+MOST = 2_000_000
 
 _lock = threading.RLock()
 
@@ -33,9 +34,9 @@ class Compiled:
         self.cell[CALLEES:] = [each.cell.ctypes.data for each in self.callees]
         self.engines: list[Any] = []
 
-    def load(self, code: bytes) -> None:
-        """Have code called from now on."""
-        engine = loaded(code)
+    def load(self, *code: bytes) -> None:
+        """Have code called from now on, which may be of several modules."""
+        engine = loaded(*code)
         self.engines.append(engine)
         self.cell[0] = engine.get_function_address(SYMBOL)
 
@@ -49,9 +50,11 @@ def compiled(unit: Unit) -> Compiled:
         made = _compiled.get(unit.key)
         if made is None:
             made = Compiled(unit)
-            made.load(kept_or_compiled(unit.text, 0))
+            loops = [kept_or_compiled(unit.loops, HEAVY_LOOPS)] if unit.loops else []
+            made.load(kept_or_compiled(unit.text, AT_ONCE), *loops)
             _compiled[unit.key] = made
-            _watch(made)
+            if unit.size <= MOST:
+                _watch(made)
         return made
 
 
@@ -79,13 +82,12 @@ def _end() -> None:
 
 
 def _improve() -> None:
-    """Compile again what has been called often, with all that it calls if that is not too much."""
+    """Compile again what has been called often, with all that it calls."""
     while not _stop.wait(PAUSE):
         made = _called_often()
         if made is None:
             continue
-        together = _is_small(made)
-        text = made.unit.together() if together else made.unit.text
+        text = made.unit.together()
         try:
             code = files.read(file_of(text, CARE)) or _compiled_beside(text)
         except (OSError, EOFError):  # no process may be started here, or it has ended
@@ -93,29 +95,18 @@ def _improve() -> None:
         if _stop.is_set():
             return
         made.load(code)
-        for part in made.unit.all_parts() if together else ():  # which it calls no longer
+        for part in made.unit.all_parts():  # which it calls no longer
             _compiled[part.key].cell[1] = 0
 
 
 def _called_often() -> Compiled | None:
-    """What has been called often: the largest that is compiled with all that it calls, else the one called most often.
-
-    It is watched no longer.
-    """
+    """The largest of what has been called often; it is watched no longer."""
     with _lock:  # others may add to these meanwhile
         often = [made for made in _watched if made.cell[1] > OFTEN]
-        if not often:
-            return None
-        together = filter(_is_small, often)
-        made = max(together, key=lambda made: made.unit.size, default=None)
-        made = made or max(often, key=lambda made: made.cell[1])
-        _watched.discard(made)
+        made = max(often, key=lambda made: made.unit.size, default=None)
+        if made is not None:
+            _watched.discard(made)
         return made
-
-
-def _is_small(made):
-    """Whether it is compiled with all that it calls."""
-    return made.unit.size <= MOST_TOGETHER
 
 
 def _compiled_beside(text: str) -> bytes:

@@ -13,26 +13,32 @@ SYMBOL = "scalars"
 ON_STACK = 1 << 14  # bytes of a function's own memory: LLVM keeps in registers what is there, and stacks hold some MB
 # As `emission` writes them.
 HEAD = re.compile(r"define void (@\w+\(.*)ptr %memory, ptr %cell\) nounwind \{\nentry:\n")
+LOOP_HEAD = re.compile(r"define void (@loop.*) nounwind \{\n")
 CALL = re.compile(r"call void %\w+\((.*)\) ; callee (\d+)")
+BEYOND = re.compile(r"^%beyond = getelementptr .*\n", re.MULTILINE)
 COUNTED = re.compile(r"^store i64 %\w+, ptr %counter\n", re.MULTILINE)
 
 
 class Unit:
     """Code of a function for a number of members at once.
 
+    - `text`: of the module of the function; `loops`: of the module of its heavy loops, if there are any.
     - `callees`: what it calls, in the order of its cell; `memory`: bytes that it needs, with what it calls.
     - `key`: what tells it from others, by its text and what it calls.
     """
 
-    def __init__(self, text: str, own_memory: int, callees: "list[Unit]") -> None:
-        self.text, self.callees, self._own_memory = text, callees, own_memory
+    def __init__(self, text: str, loops: str, own_memory: int, callees: "list[Unit]") -> None:
+        self.text = text
+        self.loops = loops
+        self.callees = callees
+        self._own_memory = own_memory
         self.memory = own_memory + max((each.memory for each in callees), default=0)
-        self.key = digest(text, *(each.key for each in callees))
+        self.key = digest(text, loops, *(each.key for each in callees))
 
     @cached_property
     def size(self) -> int:
         """Characters of its text, and those of all that it calls."""
-        return sum(len(part.text) for part in self.all_parts())
+        return sum(len(part.text) + len(part.loops) for part in self.all_parts())
 
     def all_parts(self) -> "list[Unit]":
         """It, and all that it calls, each once."""
@@ -55,15 +61,15 @@ class Unit:
         lines = []
         for part in self.all_parts():
             for line in part._within(part is self).split("\n"):
-                if line.startswith("declare"):
-                    declarations.add(line)
-                else:
+                if not line.startswith("declare"):
                     lines.append(line)
+                elif not line.startswith("declare void @loop"):  # which are here
+                    declarations.add(line)
         return "\n".join([*sorted(declarations), *lines])
 
     def _within(self, is_root):
         """Its text among those of others."""
-        text = COUNTED.sub("", self.text)
+        text = COUNTED.sub("", f"{self.loops}\n{self.text}")
         text = CALL.sub(lambda call: f"call void @{SYMBOL}{self.callees[int(call[2])].key}({call[1]})", text)
         begins = "define void" if is_root else "define internal void"
         ends = "nounwind {" if is_root else "nounwind alwaysinline {"
@@ -72,10 +78,9 @@ class Unit:
         if self._own_memory <= ON_STACK:
             memory = "beyond"
             room = f"%memory = alloca [{max(self._own_memory, 1)} x i8], align {ALIGNMENT}\n"
-            text = text.replace(
-                f"getelementptr i8, ptr %memory, i64 {self._own_memory}\n", "getelementptr i8, ptr %beyond, i64 0\n"
-            )
+            text = BEYOND.sub("", text)
         text = HEAD.sub(rf"{begins} \1ptr %{memory}, ptr %cell) {ends}\nentry:\n{room}", text)
+        text = LOOP_HEAD.sub(r"define internal void \1 nounwind alwaysinline {\n", text)
         # Names of what another text may have too.
         return text if is_root else re.sub(rf"(@\w*?\.?){SYMBOL}(?!\w)", rf"\1{SYMBOL}{self.key}", text)
 
@@ -90,5 +95,5 @@ def unit(function: Function, lanes: int) -> Unit:
         versions = _units.setdefault(function, {})
         if lanes not in versions:
             code = emitted(function, lanes, SYMBOL)
-            versions[lanes] = Unit(code.text, code.own_memory, [unit(each, lanes) for each in code.callees])
+            versions[lanes] = Unit(code.text, code.loops, code.own_memory, [unit(each, lanes) for each in code.callees])
         return versions[lanes]

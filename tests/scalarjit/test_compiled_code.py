@@ -28,8 +28,8 @@ PATIENCE = 60.0  # seconds, where others work too
 def test_what_runs_often_is_compiled_again_to_the_same_bits(monkeypatch):
     loaded = []
 
-    def load(self, code, load=Compiled.load):
-        load(self, code)
+    def load(self, *code, load=Compiled.load):
+        load(self, *code)
         loaded.append(self)
 
     monkeypatch.setattr(Compiled, "load", load)

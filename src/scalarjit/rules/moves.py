@@ -128,6 +128,7 @@ def _concatenate(graph, name, out, arrays, *, dimension):
     others = sum(array.size for array in arrays if not has_entries(array))
     if math.prod(out.shape) <= MANY and others <= (UNROLLED if any(map(_mostly_constant, arrays)) else 0):
         return Entries(graph, np.concatenate([array.steady().scalars() for array in arrays], dimension), out.dtype)
+    arrays = [array.steady() for array in arrays]  # each entry is chosen among entries of all
     begins = np.cumsum([0, *(array.shape[dimension] for array in arrays)])
 
     def element(index):
@@ -151,7 +152,7 @@ def _concatenate(graph, name, out, arrays, *, dimension):
             )
         return found()
 
-    return Delayed(graph, out.shape, out.dtype, element, is_steady=all(array.is_steady for array in arrays))
+    return Delayed(graph, out.shape, out.dtype, element, is_steady=True)
 
 
 @rule("stack")
@@ -202,6 +203,7 @@ def _pad(graph, name, out, arrays, *, padding_config):
             spaced = spaced[(*[slice(None)] * axis, slice(max(-low, 0), spaced.shape[axis] - max(-high, 0)))]
         widths = [(max(low, 0), max(high, 0)) for low, high, _ in padding_config]
         return Entries(graph, np.pad(spaced, widths, constant_values=filler), out.dtype)
+    array = array.steady()
 
     def element(index):
         inside: Any = True
@@ -217,7 +219,7 @@ def _pad(graph, name, out, arrays, *, padding_config):
             places.append(chosen(graph, within, place, 0))
         return chosen_scalars(graph, inside, lambda: array.at(tuple(places)), lambda: filler)
 
-    return Delayed(graph, out.shape, out.dtype, element, is_steady=array.is_steady)
+    return Delayed(graph, out.shape, out.dtype, element, is_steady=True)
 
 
 @rule("empty", "empty2")

@@ -80,6 +80,8 @@ def _gather(graph, name, out, arrays, *, dimension_numbers, slice_sizes, mode, f
     is_known = bool(np.all(indices.scalars() < 0)) if indices.size <= MANY else False
     if not is_known and isinstance(array, Entries) and array.size > 1:
         array = array.stored()
+    # Each place is looked up, also those that are filled: products may not be computed for them again.
+    array = array.steady()
 
     def element(index):
         batch = tuple(index[axis] for axis in of_batch)
@@ -104,14 +106,13 @@ def _gather(graph, name, out, arrays, *, dimension_numbers, slice_sizes, mode, f
         return chosen_scalars(graph, inside, lambda: array.at(tuple(places)), lambda: filler)
 
     entries = is_known and has_entries(array) and math.prod(out.shape) <= MANY
-    steady = array.is_steady and indices.is_steady
     return made(
         graph,
         out.shape,
         out.dtype,
         element if is_known and entries else by_entry(element),
         entries=entries,
-        is_steady=steady,
+        is_steady=indices.is_steady,
     )
 
 

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from scalarjit.arrays import Entries, Number, Stored, are_known, by_entry, every, ravelled, unravelled
+from scalarjit.arrays import Entries, Number, Stored, are_known, by_entry, every, nested, ravelled, unravelled
 from scalarjit.graph import INDEX, Buffer, Graph, Store, as_scalar, constant, constants, number_of
 from scalarjit.rules.rule import MANY, SMALL, UNROLLED, has_entries, made, rule, written
 
 PASSES = 8  # of a sum in a loop that are written one by one
+TILE = 8  # entries of a row of a product that are added up at once
 FEW = 4  # entries of a row that may be nonzero, up to which a product leaves out the others
 
 
@@ -192,39 +193,70 @@ def _dot(graph, name, out, arrays, *, dimension_numbers, **params):
     few = None if entries else _least(_few_nonzero(left, left_axes), _few_nonzero(right, right_axes))
     if not entries:
         left, right = left.steady(), right.steady()
-    num_batch, num_left = len(left_batch), len(left_free)
+    num_batch = len(left_batch)
+    num_left = len(left_free)
 
-    def element(index):
-        batch, of_left, of_right = (
-            index[:num_batch],
-            index[num_batch : num_batch + num_left],
-            index[num_batch + num_left :],
-        )
-
-        rows = [
+    def rows(index):
+        """Indices of both operands, but for those along which products are added up."""
+        batch = index[:num_batch]
+        of_left = index[num_batch : num_batch + num_left]
+        of_right = index[num_batch + num_left :]
+        return [
             dict(zip(axes, batch, strict=True)) | dict(zip(free, of_free, strict=True))
             for axes, free, of_free in ((left_batch, left_free, of_left), (right_batch, right_free, of_right))
         ]
 
-        def entry(array, row, axes, along):
-            found = row | dict(zip(axes, along, strict=True))
-            return array.at(tuple(found[axis] for axis in range(len(array.shape))))
+    def added(found, index, along):
+        factors = []
+        for array, row, axes in zip((left, right), rows(index), (left_axes, right_axes), strict=True):
+            places = row | dict(zip(axes, along, strict=True))
+            factor = array.at(tuple(places[axis] for axis in range(len(array.shape))))
+            factors.append(graph.map(("convert", out.dtype), factor))
+        return graph.map("add", found, graph.map("mul", *factors))
 
+    def element(index):
         def term(number, found):
             if few is not None:
                 of, places = few
-                row = [rows[of][axis] for axis in sorted(rows[of])]
-                number = number_of(graph, Entries(graph, constants(places), INDEX).at((*row, number)))
-            along = unravelled(number, inner)
-            one = entry(left, rows[0], left_axes, along)
-            other = entry(right, rows[1], right_axes, along)
-            product = graph.map("mul", *(graph.map(("convert", out.dtype), part) for part in (one, other)))
-            return graph.map("add", found, product)
+                row = rows(index)[of]
+                number = number_of(
+                    graph, Entries(graph, constants(places), INDEX).at((*(row[axis] for axis in sorted(row)), number))
+                )
+            return added(found, index, unravelled(number, inner))
 
         terms = count if few is None else few[1].shape[-1]
         return folded(graph, terms, constant(0, out.dtype), term, entries and are_known(index))
 
-    return made(graph, out.shape, out.dtype, element if entries else by_entry(element), entries=entries)
+    if entries or few is not None or math.prod(out.shape) <= SMALL:
+        return made(graph, out.shape, out.dtype, element if entries else by_entry(element), entries=entries)
+    return written(graph, out, lambda buffer: _in_tiles(graph, out, inner, added, buffer))
+
+
+def _in_tiles(graph, out, inner, added, buffer):
+    """Write products of arrays, several entries of a row at once: a sum waits for its terms, others go on meanwhile."""
+    *outer, columns = out.shape
+    zero = constant(0, out.dtype)
+
+    def tile(row, begin, width):
+        indices = [(*row, begin + number) for number in range(width)]
+        sums = nested(
+            graph,
+            inner,
+            [zero] * width,
+            lambda along, *sums: [added(each, index, along) for each, index in zip(sums, indices, strict=True)],
+        )
+        for index, each in zip(indices, sums, strict=True):
+            graph.do(Store(buffer, as_scalar(ravelled(index, out.shape)), each))
+
+    def line(row):
+        whole, rest = divmod(columns, TILE)
+        if whole:
+            nested(graph, (whole,), (), lambda number: tile(row, number[0] * TILE, TILE) or ())
+        if rest:
+            tile(row, columns - rest, rest)
+        return ()
+
+    nested(graph, tuple(outer), (), line)
 
 
 def _few_nonzero(array, axes):
