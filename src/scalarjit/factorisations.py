@@ -60,26 +60,36 @@ def _exchanged(array, one, other):
 
 
 def lu(matrix, **_params):
-    """L and U of P A = L U in one matrix, pivots, the largest of their columns, and the permutation of rows."""
+    """L and U of P A = L U in one matrix, pivots, the largest of their columns, and the permutation of rows.
+
+    Rows stay in their places until the end: to exchange them would be to choose among them for each entry of each step.
+    """
     rows, columns = matrix.shape
     places = jnp.arange(rows)
 
     def step(number, found):
-        matrix, pivots, order = found
-        sizes = jnp.where(places >= number, jnp.abs(matrix[:, number]), -1.0)
-        pivot = jnp.argmax(sizes).astype(pivots.dtype)
-        pivots = pivots.at[number].set(pivot)
-        matrix = _exchanged(matrix, number, pivot)
-        order = _exchanged(order, number, pivot)
-        below = places > number
-        at = matrix[number, number]
-        factors = jnp.where(below & (at != 0.0), matrix[:, number] / at, matrix[:, number])
-        matrix = matrix.at[:, number].set(factors)
-        right = jnp.where(jnp.arange(columns) > number, matrix[number], 0.0)
-        return matrix - jnp.where(below, factors, 0.0)[:, None] * right, pivots, order
+        rest, lower, is_above, pivots, order = found
+        column = rest[:, number]
+        pivot = jnp.argmax(jnp.where(places >= number, jnp.abs(column[order]), -1.0)).astype(pivots.dtype)
+        row = order[pivot]
+        at = column[row]
+        is_above = is_above.at[row].set(True)
+        factors = jnp.where(is_above, 0.0, jnp.where(at != 0.0, column / at, column))
+        right = jnp.where(jnp.arange(columns) > number, rest[row], 0.0)
+        return (
+            rest - factors[:, None] * right,
+            lower.at[:, number].set(factors),
+            is_above,
+            pivots.at[number].set(pivot),
+            _exchanged(order, number, pivot),
+        )
 
-    pivots = jnp.zeros(min(rows, columns), jnp.int32)
-    return _each_row(min(rows, columns), step, (matrix, pivots, jnp.arange(rows, dtype=jnp.int32)))
+    count = min(rows, columns)
+    order = jnp.arange(rows, dtype=jnp.int32)
+    begin = matrix, jnp.zeros_like(matrix), jnp.zeros(rows, bool), jnp.zeros(count, jnp.int32), order
+    upper, lower, _, pivots, order = _each_row(count, step, begin)
+    is_below = places[:, None] > jnp.arange(columns)
+    return jnp.where(is_below, lower[order], upper[order]), pivots, order
 
 
 def lu_pivots_to_permutation(pivots, *, permutation_size):

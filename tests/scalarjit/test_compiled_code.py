@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from agreement import agrees, numbers
 from jax import lax
-from test_control import FUNCTIONS, SHAPES
+from test_control import FUNCTIONS, SHAPES, known_for_a_while, scanned
 
-from scalarjit import handlers, machine, scalarised
+from scalarjit import handlers, machine, scalarised, weights
 from scalarjit.compiler import CARE, object_code
 from scalarjit.functions import function_of
 from scalarjit.graph import Copy, For, If, While
@@ -64,6 +64,24 @@ def test_code_with_all_that_it_calls_has_the_same_bits(function, shape, monkeypa
     for unit in registered:
         machine.compiled(unit).load(object_code(unit.together(), CARE))
     jax.tree.map(np.testing.assert_array_equal, (alone(*one), of_batch(*several)), first)
+
+
+@pytest.mark.parametrize("function", [each for each in FUNCTIONS if each not in (known_for_a_while, scanned)])
+def test_loops_in_a_module_of_their_own_have_the_same_bits(function, monkeypatch):
+    """Each loop, or none: what is around it, what it carries, masks of members, calls in it."""
+    registered = set()
+    register = handlers.Handler.register
+    monkeypatch.setattr(handlers.Handler, "register", lambda self: registered.add(self.unit) or register(self))
+    found = []
+    for heavy in (0, np.inf):
+        monkeypatch.setattr(weights, "HEAVY", heavy)
+        registered.clear()
+        alone = jax.jit(scalarised(lambda x, y: function(x, y)))
+        of_batch = jax.jit(jax.vmap(scalarised(lambda x, y: function(x, y))))
+        one, several = ([numbers(*more, 40, 30, seed=seed) for seed in (0, 1)] for more in ((), (3,)))
+        found.append((alone(*one), of_batch(*several)))
+        assert heavy or any(part.loops for unit in registered for part in unit.all_parts())
+    jax.tree.map(np.testing.assert_array_equal, *found)
 
 
 def copies_in_loops(region, inside=False):
