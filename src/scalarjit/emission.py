@@ -273,6 +273,7 @@ class _Emission(Instructions):
     # Regions.
 
     def region(self, region: Region) -> None:
+        expanded = self.expanded.copy()  # what is expanded in a branch is so there alone
         for item in region.items:
             if isinstance(item, int):
                 if item in self.used:
@@ -289,6 +290,7 @@ class _Emission(Instructions):
                 self.if_(item)
             else:
                 self.called(item)
+        self.expanded = expanded
 
     def scalar(self, scalar: int) -> None:
         name = self.graph.names[scalar]
