@@ -44,13 +44,12 @@ def object_code(text: str, level: int) -> bytes:
     """Compile the text of a module."""
     machine = _target(level)
     module = llvm.parse_assembly(text)
-    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=1))
-    if level == HEAVY_LOOPS:
-        passes = llvm.create_new_module_pass_manager()
-        passes.add_instruction_combine_pass()
+    if level != AT_ONCE:
+        builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=1))
+        passes = builder.getModulePassManager() if level == CARE else llvm.create_new_module_pass_manager()
+        if level == HEAVY_LOOPS:
+            passes.add_instruction_combine_pass()
         passes.run(module, builder)
-    elif level == CARE:
-        builder.getModulePassManager().run(module, builder)
     return machine.emit_object(module)
 
 

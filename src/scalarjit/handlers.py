@@ -9,9 +9,9 @@ import jax
 
 from scalarjit import packing
 from scalarjit.compiler import AT_ONCE, digest, kept_or_compiled, loaded
-from scalarjit.emission import ALIGNMENT
 from scalarjit.function import Function
 from scalarjit.machine import compiled
+from scalarjit.memory import ALIGNMENT
 from scalarjit.units import Unit, unit
 
 HANDLER = """

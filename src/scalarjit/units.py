@@ -6,8 +6,9 @@ import weakref
 from functools import cached_property
 
 from scalarjit.compiler import digest
-from scalarjit.emission import ALIGNMENT, emitted
+from scalarjit.emission import emitted
 from scalarjit.function import Function
+from scalarjit.memory import ALIGNMENT
 
 SYMBOL = "scalars"
 ON_STACK = 1 << 14  # bytes of a function's own memory: LLVM keeps in registers what is there, and stacks hold some MB

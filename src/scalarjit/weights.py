@@ -3,7 +3,7 @@
 from scalarjit.function import Function
 from scalarjit.graph import For, If, Region, Store, While
 
-HEAVY = 512  # times of its text that a loop does, from which it is compiled with care at once
+HEAVY = 512  # times of its text that a loop does, from which it is compiled with more care at once
 
 
 def used_scalars(function: Function) -> set[int]:

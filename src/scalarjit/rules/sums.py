@@ -247,11 +247,12 @@ def _in_tiles(graph, out, inner, added, buffer):
         )
         for index, each in zip(indices, sums, strict=True):
             graph.do(Store(buffer, as_scalar(ravelled(index, out.shape)), each))
+        return ()
 
     def line(row):
         whole, rest = divmod(columns, TILE)
         if whole:
-            nested(graph, (whole,), (), lambda number: tile(row, number[0] * TILE, TILE) or ())
+            nested(graph, (whole,), (), lambda number: tile(row, number[0] * TILE, TILE))
         if rest:
             tile(row, columns - rest, rest)
         return ()
