@@ -47,7 +47,7 @@ class _Emission(Memory):
         super().__init__(function.graph, lanes)
         self.function = function
         self.symbol = symbol
-        self.expanded: dict[int, Buffer] = {}  # constants as vectors
+        self.expanded: dict[Buffer, Buffer] = {}  # constants as vectors
         self.callees: list[Function] = []
         self.used = used_scalars(function)
         self.is_apart = False  # in a loop of a module of its own
@@ -58,10 +58,10 @@ class _Emission(Memory):
         function = self.function
         parameters = []
         for number, buffer in enumerate(function.passed):
-            self.places[id(buffer)] = f"%a{number}"
+            self.places[buffer] = f"%a{number}"
             parameters.append(f"ptr noalias readonly %a{number}")
         for number, buffer in enumerate(function.buffers):
-            self.places[id(buffer)] = f"%r{number}"
+            self.places[buffer] = f"%r{number}"
             parameters.append(f"ptr noalias %r{number}")
         parameters += ["ptr %memory", "ptr %cell"]
         self.counts(1)
@@ -80,7 +80,7 @@ class _Emission(Memory):
         named = set(re.findall(r"@c\d+(?=@)", functions))
         constants = "\n".join(
             f"{name}.{symbol} = private constant [{buffer.size} x {memory_type(buffer.dtype)}] {array_text(buffer)}"
-            for buffer, name in self.constants.values()
+            for buffer, name in self.constants.items()
             if name in named
         )
         declarations = "\n".join(sorted(self.declared))
@@ -217,9 +217,9 @@ class _Emission(Memory):
         addresses = []
         for buffer in call.arguments:
             if self.lanes > 1 and buffer.kind == "constant":
-                if id(buffer) not in self.expanded:
-                    self.expanded[id(buffer)] = Buffer(buffer.dtype, buffer.size)
-                room = self.expanded[id(buffer)]
+                if buffer not in self.expanded:
+                    self.expanded[buffer] = Buffer(buffer.dtype, buffer.size)
+                room = self.expanded[buffer]
                 self.copied_by_vectors(Copy(room, buffer))
                 buffer = room
             addresses.append(self.address(buffer))

@@ -18,23 +18,23 @@ class Memory(Instructions):
     def __init__(self, graph: Graph, lanes: int) -> None:
         super().__init__(graph, lanes)
         self.mask: str | None = None  # members that take a branch, or go on
-        self.places: dict[int, str] = {}
-        self.constants: dict[int, tuple[Buffer, str]] = {}
+        self.places: dict[Buffer, str] = {}
+        self.constants: dict[Buffer, str] = {}
         self.own_memory = 0
 
     def place(self, buffer: Buffer) -> str:
         """The address of an array."""
-        found = self.places.get(id(buffer))
+        found = self.places.get(buffer)
         if found is not None:
             return found
         if buffer.kind == "constant":
             name = f"@c{len(self.constants)}"
-            self.constants[id(buffer)] = buffer, name
-            self.places[id(buffer)] = f"{name}@"
+            self.constants[buffer] = name
+            self.places[buffer] = f"{name}@"
             return f"{name}@"
         offset = self.room(max(buffer.size, 1) * np.dtype(memory_dtype(buffer)).itemsize)
-        self.places[id(buffer)] = f"getelementptr:{offset}"
-        return self.places[id(buffer)]
+        self.places[buffer] = f"getelementptr:{offset}"
+        return self.places[buffer]
 
     def room(self, size: int) -> int:
         """Take as many bytes of own memory for each member, and give where they begin."""

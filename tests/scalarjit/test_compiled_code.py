@@ -20,8 +20,9 @@ from test_control import FUNCTIONS, SHAPES, known_for_a_while, scanned
 from scalarjit import handlers, machine, scalarised, weights
 from scalarjit.compiler import CARE, object_code
 from scalarjit.functions import function_of
-from scalarjit.graph import Copy, For, If, While
+from scalarjit.graph import Buffer, Copy, For, Graph, If, While
 from scalarjit.machine import Compiled
+from scalarjit.memory import Memory
 
 PATIENCE = 60.0  # seconds, where others work too
 
@@ -83,6 +84,13 @@ def test_loops_in_a_module_of_their_own_have_the_same_bits(function, monkeypatch
         found.append((alone(*one), of_batch(*several)))
         assert heavy or any(part.loops for unit in registered for part in unit.all_parts())
     jax.tree.map(np.testing.assert_array_equal, *found)
+
+
+def test_each_array_has_a_place_of_its_own():
+    """Also one that comes after another is gone."""
+    memory = Memory(Graph(), 8)
+    places = [memory.place(Buffer(np.dtype(float), size)) for size in range(1, 100)]
+    assert len(set(places)) == len(places)
 
 
 def copies_in_loops(region, inside=False):
