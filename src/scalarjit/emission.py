@@ -5,22 +5,28 @@ what it calls, and its cell: [address of its code, number of calls, cells of wha
 cells, so that better code can take a function's place while programs run, and so that its text is the same in each
 process. At the end of such a call stands which function it calls: `units` writes those in its place.
 
-Loops that do many times what their text says are functions of a module of their own, which is compiled with more
-care at once: they are most of the work of large functions, and little of their text.
+Long code is cut into pieces, which are functions of their own. Loops that do many times what their text says are
+pieces in a module of their own, which is compiled with more care at once: they are most of the work of large functions,
+and little of their text.
 
 In vectors each entry of an array takes as many places in memory as a vector has members, one after another. Constants
 in memory, and what follows from them alone, are the same for all members and stay scalars.
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from scalarjit.function import Function
 from scalarjit.graph import Buffer, Call, Copy, For, If, Region, Store, While
 from scalarjit.memory import Memory, array_text
 from scalarjit.operations import memory_type
-from scalarjit.weights import is_heavy, used_scalars
+from scalarjit.pieces import pieces, used_scalars
 
+# Of functions. A stack that overflows is told by its guard page, as each page of a frame is touched: the frames of long
+# code are larger than that page, and beyond it may lie the stack of another thread.
+ATTRIBUTES = 'nounwind "probe-stack"="inline-asm"'
 CALLEES = 2  # entries of a cell before those of what the function calls
 
 
@@ -50,28 +56,35 @@ class _Emission(Memory):
         self.expanded: dict[Buffer, Buffer] = {}  # constants as vectors
         self.callees: list[Function] = []
         self.used = used_scalars(function)
-        self.is_apart = False  # in a loop of a module of its own
+        self.pieces = pieces(function, self.used, lanes)
+        self.piece = 0  # which is written
+        self.is_heavy = False  # it is a loop of a module of its own
+        self.count = 0
+        self.functions: list[str] = []
         self.loops: list[str] = []
         self.loop_heads: list[str] = []
+        self.parameters: list[str] = []
+        self.slots: dict[int, int] = {}  # where scalars are that other pieces need
+        self.loads: dict[int, tuple[str, str]] = {}  # blocks in which they have been loaded, and names
+        self.first_lines: list[str] = []
 
     def code(self) -> Code:
         function = self.function
-        parameters = []
         for number, buffer in enumerate(function.passed):
             self.places[buffer] = f"%a{number}"
-            parameters.append(f"ptr noalias readonly %a{number}")
+            self.parameters.append(f"ptr noalias readonly %a{number}")
         for number, buffer in enumerate(function.buffers):
             self.places[buffer] = f"%r{number}"
-            parameters.append(f"ptr noalias %r{number}")
-        parameters += ["ptr %memory", "ptr %cell"]
+            self.parameters.append(f"ptr noalias %r{number}")
         self.counts(1)
         self.region(function.graph.root)
         self.lines.append("ret void")
         entry = f"""%counter = getelementptr i64, ptr %cell, i64 1
 %beyond = getelementptr i8, ptr %memory, i64 {self.own_memory}"""
         body = "\n".join(self.lines)
-        own = f"define void @{self.symbol}({', '.join(parameters)}) nounwind {{\nentry:\n{entry}\n{body}\n}}\n"
-        text = self.module("\n".join([*self.loop_heads, own]), self.symbol)
+        parameters = ", ".join([*self.parameters, "ptr %memory", "ptr %cell"])
+        own = f"define void @{self.symbol}({parameters}) {ATTRIBUTES} {{\nentry:\n{entry}\n{body}\n}}\n"
+        text = self.module("\n".join([*self.loop_heads, *self.functions, own]), self.symbol)
         loops = self.module("\n".join(self.loops), f"{self.symbol}.loops") if self.loops else ""
         return Code(text, loops, self.callees, self.own_memory)
 
@@ -88,8 +101,16 @@ class _Emission(Memory):
         return f"{constants}\n{declarations}\n{functions}"
 
     def region(self, region: Region) -> None:
+        groups = self.pieces.groups.get(region)
+        if groups is None:
+            self.items(region.items)
+            return
+        for number, items in groups:
+            self.apart(number, lambda items=items: self.items(items))
+
+    def items(self, items: list[Any]) -> None:
         expanded = self.expanded.copy()  # what is expanded in a branch is so there alone
-        for item in region.items:
+        for item in items:
             if isinstance(item, int):
                 if item in self.used:
                     self.scalar(item)
@@ -107,6 +128,68 @@ class _Emission(Memory):
                 self.called(item)
         self.expanded = expanded
 
+    def apart(self, number: int, body: Callable[[], None], *, is_heavy: bool = False) -> None:
+        """Write a piece as a function, and call it."""
+        outer = self.piece, self.is_heavy, self.lines, self.block, self._in_block, self.loads, self.first_lines
+        self.piece = number
+        self.is_heavy = is_heavy
+        self.lines = []
+        self.begin("begin")
+        self.loads = {}
+        self.first_lines = []
+        body()
+        self.lines.append("ret void")
+        text = "\n".join(["entry:", *self.first_lines, *self.lines])
+        self.piece, self.is_heavy, self.lines, self.block, self._in_block, self.loads, self.first_lines = outer
+        pointers = ["ptr noalias %memory", "ptr noalias %beyond", "ptr %cell", "ptr %counter"]
+        parameters = [*self.parameters, *pointers]
+        if self.mask:
+            parameters.append(f"{self.vector('i1')} {self.mask}")
+        name = f"@{'loop' if is_heavy else 'piece'}{number}.{self.symbol}"
+        head = f"void {name}({', '.join(parameters)})"
+        if is_heavy:
+            self.loop_heads.append(f"declare {head}")
+            self.loops.append(f"define {head} {ATTRIBUTES} {{\n{text}\n}}\n")
+        else:
+            self.functions.append(f"define internal {head} noinline {ATTRIBUTES} {{\n{text}\n}}\n")
+        given = ", ".join(each.replace("noalias ", "").replace("readonly ", "") for each in parameters)
+        self.line(f"call void {name}({given})")
+
+    def at_hand(self, scalar: int) -> str:
+        """The name of a scalar, which is loaded where another piece has computed it."""
+        if self.pieces.home.get(scalar, 0) == self.piece:
+            return f"%v{scalar}"
+        block, name = self.loads.get(scalar, ("", ""))
+        if not name or not (self.is_heavy or block == self.block):
+            kind = self.type(scalar)
+            byte = kind.replace("i1", "i8")
+            name = f"%{self.label()}"
+            lines = [
+                f"{name}p = getelementptr i8, ptr %memory, i64 {self.slots[scalar]}",
+                f"{name}b = load {byte}, ptr {name}p",
+                f"{name} = trunc {byte} {name}b to {kind}",
+            ]
+            if byte == kind:
+                lines[1:] = [f"{name} = load {kind}, ptr {name}p"]
+            if self.is_heavy:  # before the loop, once
+                self.first_lines += lines
+            else:
+                self.lines += lines
+            self.loads[scalar] = self.block, name
+        return name
+
+    def hand_on(self, scalar: int) -> None:
+        """Store a scalar that other pieces need."""
+        kind = self.type(scalar)
+        byte = kind.replace("i1", "i8")
+        name = f"%v{scalar}"
+        if byte != kind:
+            name = self.value(f"zext {kind} {name} to {byte}")
+        if scalar not in self.slots:
+            self.slots[scalar] = self.room(8)
+        place = self.value(f"getelementptr i8, ptr %memory, i64 {self.slots[scalar]}")
+        self.line(f"store {byte} {name}, ptr {place}")
+
     def scalar(self, scalar: int) -> None:
         name = self.graph.names[scalar]
         if name in ("index", "carried"):  # written by loops
@@ -117,60 +200,37 @@ class _Emission(Memory):
             self.loaded(scalar)
         else:
             self.operation(scalar)
+        if scalar in self.pieces.crossing:
+            self.hand_on(scalar)
 
     def for_(self, loop: For) -> None:
-        if not self.is_apart and is_heavy(loop, self.used):
-            self.apart(loop)
+        number = self.pieces.heavy.get(loop)
+        if number is not None:
+            self.apart(number, lambda: self.within(loop), is_heavy=True)
         else:
             self.within(loop)
             self.counts(loop.count)
 
     def within(self, loop: For) -> None:
         self.uniform.add(loop.index)
-        self.counted(loop.count, f"%v{loop.index}", lambda: self.region(loop.region), self.carried(loop))
+        carried = [each for each in loop.carried if each[0] in self.used]
+        crossing = [each for each, _, _ in carried if each in self.pieces.crossing]
 
-    def carried(self, loop: For) -> list[tuple[int, int, int]]:
-        return [each for each in loop.carried if each[0] in self.used]
+        def one() -> None:
+            if not self.is_heavy:
+                for scalar in crossing:
+                    self.hand_on(scalar)
+                if loop.index in self.pieces.crossing:
+                    self.hand_on(loop.index)
+            self.region(loop.region)
 
-    def apart(self, loop: For) -> None:
-        """Write a loop as a function, whose arguments are what it needs; what it carries it hands on in memory."""
-        outer_lines = self.lines
-        outer_block = self.block
-        self.lines = []
-        self.block = "entry"
-        self.is_apart = True
-        self.within(loop)
-        handed_on = []
-        for scalar, _, _ in self.carried(loop):
-            place = f"getelementptr i8, ptr %memory, i64 {self.room(8)}"
-            handed_on.append((scalar, place))
-            self.line(f"store {self.type(scalar)} %v{scalar}, ptr {self.value(place)}")
-        self.line("ret void")
-        body = "\n".join(["entry:", *self.lines])
-        self.is_apart = False
-        self.lines = outer_lines
-        self.block = outer_block
-        names = set(re.findall(r"%\w+", body)) - set(re.findall(r"^(%\w+) =", body, re.MULTILINE))
-        labels = {f"%{label}" for label in re.findall(r"^(\w+):", body, re.MULTILINE)}
-        given = [(self.type_of(name), name) for name in sorted(names - labels)]
-        name = f"@loop{len(self.loops)}.{self.symbol}"
-        types = ", ".join(kind for kind, _ in given)
-        parameters = ", ".join(f"{kind}{' noalias' if kind == 'ptr' else ''} {each}" for kind, each in given)
-        self.loop_heads.append(f"declare void {name}({types})")
-        self.loops.append(f"define void {name}({parameters}) nounwind {{\n{body}\n}}\n")
-        self.line(f"call void {name}({', '.join(' '.join(each) for each in given)})")
-        for scalar, place in handed_on:
-            self.line(f"%v{scalar} = load {self.type(scalar)}, ptr {self.value(place)}")
-
-    def type_of(self, name: str) -> str:
-        """The type of what stands outside of a loop."""
-        if name.startswith("%v"):
-            return self.type(int(name[2:]))
-        return self.vector("i1") if name == self.mask else "ptr"
+        self.counted(loop.count, f"%v{loop.index}", one, carried)
+        for scalar in crossing:
+            self.hand_on(scalar)
 
     def counts(self, number: int) -> None:
         """Count passes of loops as calls: what makes many of them is worth better code, but for those that have it."""
-        if self.is_apart:
+        if self.is_heavy:
             return
         calls = self.value("load i64, ptr %counter")
         self.line(f"store i64 {self.value(f'add i64 {calls}, {number}')}, ptr %counter")

@@ -65,9 +65,11 @@ class Memory(Instructions):
         if offset < 0:
             return self.value(f"getelementptr {kind}, ptr {base}, i64 {int(value_of(offset)) * scale}")
         if self.is_uniform(offset):
-            number = f"%v{offset}" if scale == 1 else self.value(f"mul i64 %v{offset}, {scale}")
+            number = self.operand(offset)
+            if scale > 1:
+                number = self.value(f"mul i64 {number}, {scale}")
             return self.value(f"getelementptr {kind}, ptr {base}, i64 {number}")
-        places = f"%v{offset}"
+        places = self.operand(offset)
         if scale > 1:
             steps = ", ".join(f"i64 {lane}" for lane in range(self.lanes))
             times = self.value(f"mul {self.vector('i64')} {places}, splat (i64 {scale})")

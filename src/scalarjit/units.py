@@ -13,8 +13,8 @@ from scalarjit.memory import ALIGNMENT
 SYMBOL = "scalars"
 ON_STACK = 1 << 14  # bytes of a function's own memory: LLVM keeps in registers what is there, and stacks hold some MB
 # As `emission` writes them.
-HEAD = re.compile(r"define void (@\w+\(.*)ptr %memory, ptr %cell\) nounwind \{\nentry:\n")
-LOOP_HEAD = re.compile(r"define void (@loop.*) nounwind \{\n")
+HEAD = re.compile(r"define void (@\w+\(.*)ptr %memory, ptr %cell\) nounwind (.*\{\nentry:\n)")
+LOOP_HEAD = re.compile(r"define void (@loop.*) nounwind (.*\{\n)")
 CALL = re.compile(r"call void %\w+\((.*)\) ; callee (\d+)")
 BEYOND = re.compile(r"^%beyond = getelementptr .*\n", re.MULTILINE)
 COUNTED = re.compile(r"^store i64 %\w+, ptr %counter\n", re.MULTILINE)
@@ -73,15 +73,15 @@ class Unit:
         text = COUNTED.sub("", f"{self.loops}\n{self.text}")
         text = CALL.sub(lambda call: f"call void @{SYMBOL}{self.callees[int(call[2])].key}({call[1]})", text)
         begins = "define void" if is_root else "define internal void"
-        ends = "nounwind {" if is_root else "nounwind alwaysinline {"
+        ends = "nounwind" if is_root else "nounwind alwaysinline"
         memory = "memory"
         room = ""
         if self._own_memory <= ON_STACK:
             memory = "beyond"
             room = f"%memory = alloca [{max(self._own_memory, 1)} x i8], align {ALIGNMENT}\n"
             text = BEYOND.sub("", text)
-        text = HEAD.sub(rf"{begins} \1ptr %{memory}, ptr %cell) {ends}\nentry:\n{room}", text)
-        text = LOOP_HEAD.sub(r"define internal void \1 nounwind alwaysinline {\n", text)
+        text = HEAD.sub(rf"{begins} \1ptr %{memory}, ptr %cell) {ends} \2{room}", text)
+        text = LOOP_HEAD.sub(r"define internal void \1 nounwind alwaysinline \2", text)
         # Names of what another text may have too.
         return text if is_root else re.sub(rf"(@\w*?\.?){SYMBOL}(?!\w)", rf"\1{SYMBOL}{self.key}", text)
 

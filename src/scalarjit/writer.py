@@ -82,8 +82,12 @@ class Writer:
                 return text
             return f"splat ({llvm_type(self.graph.dtype(scalar))} {text})"
         if uniform or not self.is_uniform(scalar) or self.lanes == 1:
-            return f"%v{scalar}"
-        return self.splat(f"%v{scalar}", llvm_type(self.graph.dtype(scalar)))
+            return self.at_hand(scalar)
+        return self.splat(self.at_hand(scalar), llvm_type(self.graph.dtype(scalar)))
+
+    def at_hand(self, scalar: int) -> str:
+        """The name of a scalar that is no constant."""
+        return f"%v{scalar}"
 
     def splat(self, text: str, of: str) -> str:
         vector = self.vector(of)

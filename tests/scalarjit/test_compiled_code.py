@@ -17,8 +17,9 @@ from agreement import agrees, numbers
 from jax import lax
 from test_control import FUNCTIONS, SHAPES, known_for_a_while, scanned
 
-from scalarjit import handlers, machine, scalarised, weights
+from scalarjit import handlers, machine, pieces, scalarised
 from scalarjit.compiler import CARE, object_code
+from scalarjit.emission import emitted
 from scalarjit.functions import function_of
 from scalarjit.graph import Buffer, Copy, For, Graph, If, While
 from scalarjit.machine import Compiled
@@ -69,21 +70,41 @@ def test_code_with_all_that_it_calls_has_the_same_bits(function, shape, monkeypa
 
 
 @pytest.mark.parametrize("function", [each for each in FUNCTIONS if each not in (known_for_a_while, scanned)])
-def test_loops_in_a_module_of_their_own_have_the_same_bits(function, monkeypatch):
-    """Each loop, or none: what is around it, what it carries, masks of members, calls in it."""
+def test_code_in_pieces_has_the_same_bits(function, monkeypatch):
+    """Loops in a module of their own, a few operations in each function, or none of both: what other pieces need."""
     registered = set()
     register = handlers.Handler.register
     monkeypatch.setattr(handlers.Handler, "register", lambda self: registered.add(self.unit) or register(self))
     found = []
-    for heavy in (0, np.inf):
-        monkeypatch.setattr(weights, "HEAVY", heavy)
+    names = []
+    for heavy, most in (np.inf, 10**9), (0, 10**9), (np.inf, 8):
+        monkeypatch.setattr(pieces, "HEAVY", heavy)
+        monkeypatch.setattr(pieces, "LONG", most)
         registered.clear()
         alone = jax.jit(scalarised(lambda x, y: function(x, y)))
         of_batch = jax.jit(jax.vmap(scalarised(lambda x, y: function(x, y))))
         one, several = ([numbers(*more, 40, 30, seed=seed) for seed in (0, 1)] for more in ((), (3,)))
         found.append((alone(*one), of_batch(*several)))
-        assert heavy or any(part.loops for unit in registered for part in unit.all_parts())
-    jax.tree.map(np.testing.assert_array_equal, *found)
+        text = "".join(part.text for unit in registered for part in unit.all_parts())
+        names.append({name for name in ("@piece", "@loop") if name in text})
+    assert "@loop" in names[1]
+    assert "@piece" in names[2]
+    for each in found[1:]:
+        jax.tree.map(np.testing.assert_array_equal, each, found[0])
+
+
+def test_functions_are_short():
+    """At level 0 each value has a place of its own on the stack: those of a bicycle overflowed it once."""
+
+    def function(x):
+        for number in range(120):
+            x = x @ x.T / 10 + number
+        return x
+
+    code = emitted(function_of(jax.make_jaxpr(function)(numbers(8, 8)), [None]), 8, "name")
+    lines = [len(block.splitlines()) for block in re.findall(r"^define .*?^}", code.text, re.MULTILINE | re.DOTALL)]
+    assert sum(lines) > 80_000
+    assert max(lines) < 8_000  # vectors of eight doubles: 0.5 MB
 
 
 def test_each_array_has_a_place_of_its_own():
