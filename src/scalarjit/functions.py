@@ -23,6 +23,9 @@ class Functions:
     def __init__(self) -> None:
         self._versions: dict[int, tuple[Any, list[Function]]] = {}
 
+    def clear(self) -> None:
+        self._versions.clear()
+
     def of(self, closed: ClosedJaxpr, arrays: list[Array]) -> Function:
         """Give the function for arguments: one that knows the same constants or most of them, or a new one."""
         _, versions = self._versions.setdefault(id(closed.jaxpr), (closed, []))
@@ -63,7 +66,8 @@ def _common(own, given):
 def function_of(closed: ClosedJaxpr, known: Iterable[np.ndarray | None]) -> Function:
     """Walk through a traced function into a graph of its own."""
     graph = Graph()
-    function = Function(graph, list(known))
+    constants = list(known)
+    function = Function(graph, constants, lambda: function_of(closed, constants))
     inputs: list[Array] = []
     for number, (var, constants_) in enumerate(zip(closed.jaxpr.invars, function.known, strict=True)):
         check(var.aval)

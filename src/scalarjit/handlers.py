@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from scalarjit import packing
+from scalarjit import machine, packing
 from scalarjit.compiler import AT_ONCE, digest, kept_or_compiled, loaded
 from scalarjit.function import Function
 from scalarjit.machine import compiled
@@ -77,7 +77,9 @@ class Handler:
 
     def register(self) -> None:
         """Tell JAX, which may call it as long as the process lives."""
-        if self.name in registered:
+        known = self.name in registered
+        registered[self.name] = self
+        if known:
             return
         made = compiled(self.unit)
         engine = loaded(kept_or_compiled(self.text, AT_ONCE))
@@ -85,12 +87,18 @@ class Handler:
             ctypes.c_int64.from_address(engine.get_global_value_address(name)).value = address
         called = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(engine.get_function_address("handler"))
         jax.ffi.register_ffi_target(self.name, jax.ffi.pycapsule(called), platform="cpu", api_version=1)
-        registered[self.name] = self
         _in_use.append((made, engine, called))
 
 
-registered: dict[str, Handler] = {}
+registered: dict[str, Handler | None] = {}  # None for those whose text has been let go of
 _in_use: list[Any] = []
+
+
+def clear() -> None:
+    """Let go of texts."""
+    for name in registered:
+        registered[name] = None
+    machine.clear()
 
 
 def handler_of(function: Function, lanes: int, members: int | None = None, batched: tuple[bool, ...] = ()) -> Handler:

@@ -124,6 +124,8 @@ def _new(place, lowered):
     blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), lowered.out_info).tree
     names = [] if handlers is None else sorted(set(re.findall(handlers.NAMES, text)))
     called = [handlers.registered[name] for name in names]
+    if None in called:  # their text has been let go of
+        return None
 
     def compile():
         _listen()

@@ -28,7 +28,7 @@ class Compiled:
     """
 
     def __init__(self, unit: Unit) -> None:
-        self.unit = unit
+        self.unit: Unit | None = unit  # None where its text has been let go of
         self.callees = [compiled(each) for each in unit.callees]
         self.cell = np.zeros(CALLEES + len(self.callees), np.int64)
         self.cell[CALLEES:] = [each.cell.ctypes.data for each in self.callees]
@@ -56,6 +56,14 @@ def compiled(unit: Unit) -> Compiled:
             if unit.size <= MOST:
                 _watch(made)
         return made
+
+
+def clear() -> None:
+    """Let go of texts: what is compiled stays as it is."""
+    with _lock:
+        _watched.clear()
+        for made in _compiled.values():
+            made.unit = None
 
 
 # A thread that has compiled again what runs often.
@@ -87,7 +95,10 @@ def _improve() -> None:
         made = _called_often()
         if made is None:
             continue
-        text = made.unit.together()
+        unit = made.unit
+        if unit is None:
+            continue
+        text = unit.together()
         try:
             code = files.read(file_of(text, CARE)) or _compiled_beside(text)
         except (OSError, EOFError):  # no process may be started here, or it has ended
@@ -95,7 +106,7 @@ def _improve() -> None:
         if _stop.is_set():
             return
         made.load(code)
-        for part in made.unit.all_parts():  # which it calls no longer
+        for part in unit.all_parts():  # which it calls no longer
             _compiled[part.key].cell[1] = 0
 
 
@@ -103,10 +114,14 @@ def _called_often() -> Compiled | None:
     """The largest of what has been called often; it is watched no longer."""
     with _lock:  # others may add to these meanwhile
         often = [made for made in _watched if made.cell[1] > OFTEN]
-        made = max(often, key=lambda made: made.unit.size, default=None)
+        made = max(often, key=_size, default=None)
         if made is not None:
             _watched.discard(made)
         return made
+
+
+def _size(made):
+    return made.unit.size if made.unit else 0
 
 
 def _compiled_beside(text: str) -> bytes:

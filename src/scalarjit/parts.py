@@ -26,6 +26,10 @@ def is_compilable(jaxpr: Jaxpr) -> bool:
     return _able[id(jaxpr)][1]
 
 
+def clear() -> None:
+    _able.clear()
+
+
 def _have_scalars(*atoms):
     try:
         for atom in itertools.chain(*atoms):

@@ -147,3 +147,9 @@ def uses_of(jaxpr):
             last.setdefault(number, []).append(atom)
         _used[id(jaxpr)] = jaxpr, (uses, last)
     return _used[id(jaxpr)][1]
+
+
+def clear() -> None:
+    """Forget what functions have been found to be."""
+    for kept in _closed, _ordered, _implementations, _sizes, _used:
+        kept.clear()

@@ -96,6 +96,11 @@ class Source:
 
 _source = lru_cache(MOST_SOURCES)(Source)
 
+
+def clear() -> None:
+    _source.cache_clear()
+
+
 scalarised_p = Primitive("scalarised")
 scalarised_p.multiple_results = True
 

@@ -95,6 +95,7 @@ def unit(function: Function, lanes: int) -> Unit:
     with _lock:
         versions = _units.setdefault(function, {})
         if lanes not in versions:
-            code = emitted(function, lanes, SYMBOL)
+            code = emitted(function.with_graph(), lanes, SYMBOL)
+            function.let_go_of_graph()
             versions[lanes] = Unit(code.text, code.loops, code.own_memory, [unit(each, lanes) for each in code.callees])
         return versions[lanes]

@@ -10,10 +10,12 @@ from typing import Any
 import equinox as eqx
 import jax
 
+import scalarjit
 from linkax.xla.users_line import warn
 
 COMPILING = "/jax/core/compile/backend_compile_duration"  # what JAX tells its listeners before XLA compiles, and after
-CACHES = [eqx.clear_caches, jax.clear_caches]  # functions that let go of compiled programs
+# Functions that let go of compiled programs, and of what they were made of.
+CACHES = [eqx.clear_caches, jax.clear_caches, scalarjit.clear_caches]
 ROOM = 10_000  # memory maps; the largest programs of linkax take 4000
 # Programs that have so much room each, and are compiled before maps are counted again: to count 30 000 of them takes
 # 25 ms, as long as to compile a small program.

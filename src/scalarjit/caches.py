@@ -1,0 +1,16 @@
+"""What functions leave behind, and how it is let go of."""
+
+from scalarjit import functions, parts, traced, transform
+
+
+def clear_caches() -> None:
+    """Let go of what is known of functions, and of their text. What is used again is traced and written again.
+
+    What is compiled stays, as JAX may call it as long as the process lives: a tenth of all.
+    """
+    functions.FUNCTIONS.clear()
+    traced.clear()
+    parts.clear()
+    transform.clear()
+    if transform.handlers is not None:
+        transform.handlers.clear()
