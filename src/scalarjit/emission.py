@@ -19,10 +19,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from scalarjit.function import Function
-from scalarjit.graph import Buffer, Call, Copy, For, If, Region, Store, While
+from scalarjit.graph import BOOL, Buffer, Call, Copy, For, If, Region, Store, While
 from scalarjit.memory import Memory, array_text
 from scalarjit.operations import memory_type
 from scalarjit.pieces import pieces, used_scalars
+from scalarjit.writer import Body
 
 # Of functions. A stack that overflows is told by its guard page, as each page of a frame is touched: the frames of long
 # code are larger than that page, and beyond it may lie the stack of another thread.
@@ -53,20 +54,15 @@ class _Emission(Memory):
         super().__init__(function.graph, lanes)
         self.function = function
         self.symbol = symbol
-        self.expanded: dict[Buffer, Buffer] = {}  # constants as vectors
+        self.expanded: dict[Buffer, Buffer] = {}  # constants as vectors, which each call writes anew
         self.callees: list[Function] = []
         self.used = used_scalars(function)
         self.pieces = pieces(function, self.used, lanes)
-        self.piece = 0  # which is written
-        self.is_heavy = False  # it is a loop of a module of its own
-        self.count = 0
         self.functions: list[str] = []
         self.loops: list[str] = []
         self.loop_heads: list[str] = []
         self.parameters: list[str] = []
         self.slots: dict[int, int] = {}  # where scalars are that other pieces need
-        self.loads: dict[int, tuple[str, str]] = {}  # blocks in which they have been loaded, and names
-        self.first_lines: list[str] = []
 
     def code(self) -> Code:
         function = self.function
@@ -78,10 +74,10 @@ class _Emission(Memory):
             self.parameters.append(f"ptr noalias %r{number}")
         self.counts(1)
         self.region(function.graph.root)
-        self.lines.append("ret void")
+        self.body.lines.append("ret void")
         entry = f"""%counter = getelementptr i64, ptr %cell, i64 1
 %beyond = getelementptr i8, ptr %memory, i64 {self.own_memory}"""
-        body = "\n".join(self.lines)
+        body = "\n".join(self.body.lines)
         parameters = ", ".join([*self.parameters, "ptr %memory", "ptr %cell"])
         own = f"define void @{self.symbol}({parameters}) {ATTRIBUTES} {{\nentry:\n{entry}\n{body}\n}}\n"
         text = self.module("\n".join([*self.loop_heads, *self.functions, own]), self.symbol)
@@ -106,10 +102,9 @@ class _Emission(Memory):
             self.items(region.items)
             return
         for number, items in groups:
-            self.apart(number, lambda items=items: self.items(items))
+            self.apart(Body(number), lambda items=items: self.items(items))
 
     def items(self, items: list[Any]) -> None:
-        expanded = self.expanded.copy()  # what is expanded in a branch is so there alone
         for item in items:
             if isinstance(item, int):
                 if item in self.used:
@@ -126,28 +121,22 @@ class _Emission(Memory):
                 self.if_(item)
             else:
                 self.called(item)
-        self.expanded = expanded
 
-    def apart(self, number: int, body: Callable[[], None], *, is_heavy: bool = False) -> None:
+    def apart(self, body: Body, write: Callable[[], None]) -> None:
         """Write a piece as a function, and call it."""
-        outer = self.piece, self.is_heavy, self.lines, self.block, self._in_block, self.loads, self.first_lines
-        self.piece = number
-        self.is_heavy = is_heavy
-        self.lines = []
+        outer = self.body
+        self.body = body
         self.begin("begin")
-        self.loads = {}
-        self.first_lines = []
-        body()
-        self.lines.append("ret void")
-        text = "\n".join(["entry:", *self.first_lines, *self.lines])
-        self.piece, self.is_heavy, self.lines, self.block, self._in_block, self.loads, self.first_lines = outer
+        write()
+        self.body = outer
+        text = "\n".join(["entry:", *body.first, *body.lines, "ret void"])
         pointers = ["ptr noalias %memory", "ptr noalias %beyond", "ptr %cell", "ptr %counter"]
         parameters = [*self.parameters, *pointers]
         if self.mask:
             parameters.append(f"{self.vector('i1')} {self.mask}")
-        name = f"@{'loop' if is_heavy else 'piece'}{number}.{self.symbol}"
+        name = f"@{'loop' if body.is_heavy else 'piece'}{body.piece}.{self.symbol}"
         head = f"void {name}({', '.join(parameters)})"
-        if is_heavy:
+        if body.is_heavy:
             self.loop_heads.append(f"declare {head}")
             self.loops.append(f"define {head} {ATTRIBUTES} {{\n{text}\n}}\n")
         else:
@@ -157,38 +146,35 @@ class _Emission(Memory):
 
     def at_hand(self, scalar: int) -> str:
         """The name of a scalar, which is loaded where another piece has computed it."""
-        if self.pieces.home.get(scalar, 0) == self.piece:
+        body = self.body
+        if self.pieces.home.get(scalar, 0) == body.piece:
             return f"%v{scalar}"
-        block, name = self.loads.get(scalar, ("", ""))
-        if not name or not (self.is_heavy or block == self.block):
+        block = "entry" if body.is_heavy else body.block  # before a loop, once
+        name = body.loads.get((scalar, block))
+        if name is None:
+            name = body.loads[scalar, block] = f"%{self.label()}"
             kind = self.type(scalar)
-            byte = kind.replace("i1", "i8")
-            name = f"%{self.label()}"
-            lines = [
-                f"{name}p = getelementptr i8, ptr %memory, i64 {self.slots[scalar]}",
-                f"{name}b = load {byte}, ptr {name}p",
-                f"{name} = trunc {byte} {name}b to {kind}",
-            ]
-            if byte == kind:
-                lines[1:] = [f"{name} = load {kind}, ptr {name}p"]
-            if self.is_heavy:  # before the loop, once
-                self.first_lines += lines
+            lines = body.first if body.is_heavy else body.lines
+            lines.append(f"{name}p = getelementptr i8, ptr %memory, i64 {self.slots[scalar]}")
+            if self.graph.dtype(scalar) == BOOL:
+                byte = kind.replace("i1", "i8")
+                lines += [f"{name}b = load {byte}, ptr {name}p", f"{name} = trunc {byte} {name}b to {kind}"]
             else:
-                self.lines += lines
-            self.loads[scalar] = self.block, name
+                lines.append(f"{name} = load {kind}, ptr {name}p")
         return name
 
     def hand_on(self, scalar: int) -> None:
         """Store a scalar that other pieces need."""
         kind = self.type(scalar)
-        byte = kind.replace("i1", "i8")
-        name = f"%v{scalar}"
-        if byte != kind:
-            name = self.value(f"zext {kind} {name} to {byte}")
+        value = f"%v{scalar}"
+        if self.graph.dtype(scalar) == BOOL:
+            byte = kind.replace("i1", "i8")
+            value = self.value(f"zext {kind} {value} to {byte}")
+            kind = byte
         if scalar not in self.slots:
             self.slots[scalar] = self.room(8)
         place = self.value(f"getelementptr i8, ptr %memory, i64 {self.slots[scalar]}")
-        self.line(f"store {byte} {name}, ptr {place}")
+        self.line(f"store {kind} {value}, ptr {place}")
 
     def scalar(self, scalar: int) -> None:
         name = self.graph.names[scalar]
@@ -206,7 +192,7 @@ class _Emission(Memory):
     def for_(self, loop: For) -> None:
         number = self.pieces.heavy.get(loop)
         if number is not None:
-            self.apart(number, lambda: self.within(loop), is_heavy=True)
+            self.apart(Body(number, is_heavy=True), lambda: self.within(loop))
         else:
             self.within(loop)
             self.counts(loop.count)
@@ -217,7 +203,7 @@ class _Emission(Memory):
         crossing = [each for each, _, _ in carried if each in self.pieces.crossing]
 
         def one() -> None:
-            if not self.is_heavy:
+            if not self.body.is_heavy:
                 for scalar in crossing:
                     self.hand_on(scalar)
                 if loop.index in self.pieces.crossing:
@@ -230,7 +216,7 @@ class _Emission(Memory):
 
     def counts(self, number: int) -> None:
         """Count passes of loops as calls: what makes many of them is worth better code, but for those that have it."""
-        if self.is_heavy:
+        if self.body.is_heavy:
             return
         calls = self.value("load i64, ptr %counter")
         self.line(f"store i64 {self.value(f'add i64 {calls}, {number}')}, ptr %counter")

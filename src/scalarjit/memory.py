@@ -180,20 +180,20 @@ class Memory(Instructions):
         inner = self.label()
         after = self.label()
         firsts = [self.operand(first, uniform=self.lanes == 1) for _, first, _ in carried]
-        before = self.block
+        before = self.body.block
         self.begin(head)
-        at = len(self.lines)
-        self.lines.extend([""] * (1 + len(carried)))
+        at = len(self.body.lines)
+        self.body.lines.extend([""] * (1 + len(carried)))
         test = self.value(f"icmp slt i64 {index}, {count}")
         self.begin(inner, after=f"br i1 {test}, label %{inner}, label %{after}")
         body()
         thens = [self.operand(then, uniform=self.lanes == 1) for _, _, then in carried]
         self.line(f"{index}n = add i64 {index}, 1")
-        last = self.block
-        self.lines[at] = f"{index} = phi i64 [0, %{before}], [{index}n, %{last}]"
+        last = self.body.block
+        self.body.lines[at] = f"{index} = phi i64 [0, %{before}], [{index}n, %{last}]"
         for number, ((scalar, _, _), first, then) in enumerate(zip(carried, firsts, thens, strict=True)):
             kind = self.type(scalar)
-            self.lines[at + 1 + number] = f"%v{scalar} = phi {kind} [{first}, %{before}], [{then}, %{last}]"
+            self.body.lines[at + 1 + number] = f"%v{scalar} = phi {kind} [{first}, %{before}], [{then}, %{last}]"
         self.begin(after, after=f"br label %{head}")
 
 

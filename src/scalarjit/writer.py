@@ -1,5 +1,7 @@
 """Lines of LLVM's language: blocks, types and operands, of one member or of vectors of members."""
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from scalarjit.graph import BOOL, Graph, value_of
@@ -27,23 +29,38 @@ def mangled(kind: str) -> str:
     return {"double": "f64", "float": "f32"}.get(kind, kind)
 
 
+@dataclass
+class Body:
+    """What is written of one piece.
+
+    - `is_heavy`: it is a loop of a module of its own.
+    - `first`: lines before all others; `loads`: names of what other pieces have computed, by scalars and blocks.
+    """
+
+    piece: int = 0
+    is_heavy: bool = False
+    first: list[str] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)
+    block: str = "entry"
+    in_block: int = 0  # lines
+    loads: dict[tuple[int, str], str] = field(default_factory=dict)
+
+
 class Writer:
-    """The lines of a function, of a number of members at once."""
+    """Lines of functions, of a number of members at once."""
 
     def __init__(self, graph: Graph, lanes: int) -> None:
         self.graph = graph
         self.lanes = lanes
-        self.lines: list[str] = []
+        self.body = Body()
         self.declared: set[str] = set()
         self.uniform: set[int] = set()  # scalars that are the same for all members
-        self.block = "entry"
         self._count = 0
-        self._in_block = 0
 
     def line(self, text: str) -> None:
-        self.lines.append(text)
-        self._in_block += 1
-        if self._in_block > BLOCK:
+        self.body.lines.append(text)
+        self.body.in_block += 1
+        if self.body.in_block > BLOCK:
             self.begin(self.label())
 
     def value(self, text: str) -> str:
@@ -58,10 +75,9 @@ class Writer:
 
     def begin(self, label: str, *, after: str | None = None) -> None:
         """Begin a block, to which the one before goes on, or ends with a line."""
-        self.lines.append(after or f"br label %{label}")
-        self.lines.append(f"{label}:")
-        self.block = label
-        self._in_block = 0
+        self.body.lines += [after or f"br label %{label}", f"{label}:"]
+        self.body.block = label
+        self.body.in_block = 0
 
     def is_uniform(self, scalar: int) -> bool:
         return self.lanes == 1 or scalar < 0 or scalar in self.uniform
