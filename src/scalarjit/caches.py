@@ -1,10 +1,10 @@
 """What functions leave behind, and how it is let go of."""
 
-from scalarjit import functions, parts, traced, transform
+from scalarjit import functions, kept_programs, parts, traced, transform
 
 
 def clear_caches() -> None:
-    """Let go of what is known of functions, and of their text. What is used again is traced and written again.
+    """Let go of what is known of functions, and of programs. What is used again is traced and written again.
 
     What is compiled stays, as JAX may call it as long as the process lives: a tenth of all.
     """
@@ -12,5 +12,6 @@ def clear_caches() -> None:
     traced.clear()
     parts.clear()
     transform.clear()
+    kept_programs.forget()
     if transform.handlers is not None:
         transform.handlers.clear()

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from scalarjit import machine, packing
+from scalarjit import packing
 from scalarjit.compiler import AT_ONCE, digest, kept_or_compiled, loaded
 from scalarjit.function import Function
 from scalarjit.machine import compiled
@@ -98,7 +98,6 @@ def clear() -> None:
     """Let go of texts."""
     for name in registered:
         registered[name] = None
-    machine.clear()
 
 
 def handler_of(function: Function, lanes: int, members: int | None = None, batched: tuple[bool, ...] = ()) -> Handler:

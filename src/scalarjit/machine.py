@@ -28,7 +28,6 @@ class Compiled:
     """
 
     def __init__(self, unit: Unit) -> None:
-        self.unit: Unit | None = unit  # None where its text has been let go of
         self.callees = [compiled(each) for each in unit.callees]
         self.cell = np.zeros(CALLEES + len(self.callees), np.int64)
         self.cell[CALLEES:] = [each.cell.ctypes.data for each in self.callees]
@@ -54,29 +53,21 @@ def compiled(unit: Unit) -> Compiled:
             made.load(kept_or_compiled(unit.text, AT_ONCE), *loops)
             _compiled[unit.key] = made
             if unit.size <= MOST:
-                _watch(made)
+                _watch(made, unit)
         return made
-
-
-def clear() -> None:
-    """Let go of texts: what is compiled stays as it is."""
-    with _lock:
-        _watched.clear()
-        for made in _compiled.values():
-            made.unit = None
 
 
 # A thread that has compiled again what runs often.
 
-_watched: "weakref.WeakSet[Compiled]" = weakref.WeakSet()
+_watched: "weakref.WeakKeyDictionary[Compiled, Unit]" = weakref.WeakKeyDictionary()
 _stop = threading.Event()
 _thread: threading.Thread | None = None
 _beside: Beside | None = None
 
 
-def _watch(made: Compiled) -> None:
+def _watch(made: Compiled, unit: Unit) -> None:
     global _thread
-    _watched.add(made)
+    _watched[made] = unit
     if _thread is None:
         _thread = threading.Thread(target=_improve, name="scalarjit", daemon=True)
         _thread.start()
@@ -92,12 +83,10 @@ def _end() -> None:
 def _improve() -> None:
     """Compile again what has been called often, with all that it calls."""
     while not _stop.wait(PAUSE):
-        made = _called_often()
-        if made is None:
+        often = _called_often()
+        if often is None:
             continue
-        unit = made.unit
-        if unit is None:
-            continue
+        made, unit = often
         text = unit.together()
         try:
             code = files.read(file_of(text, CARE)) or _compiled_beside(text)
@@ -110,18 +99,14 @@ def _improve() -> None:
             _compiled[part.key].cell[1] = 0
 
 
-def _called_often() -> Compiled | None:
+def _called_often() -> tuple[Compiled, Unit] | None:
     """The largest of what has been called often; it is watched no longer."""
     with _lock:  # others may add to these meanwhile
-        often = [made for made in _watched if made.cell[1] > OFTEN]
-        made = max(often, key=_size, default=None)
-        if made is not None:
-            _watched.discard(made)
-        return made
-
-
-def _size(made):
-    return made.unit.size if made.unit else 0
+        often = [(made, unit) for made, unit in _watched.items() if made.cell[1] > OFTEN]
+        found = max(often, key=lambda each: each[1].size, default=None)
+        if found is not None:
+            del _watched[found[0]]
+        return found
 
 
 def _compiled_beside(text: str) -> bytes:

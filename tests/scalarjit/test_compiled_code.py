@@ -38,7 +38,7 @@ def test_what_runs_often_is_compiled_again_to_the_same_bits(monkeypatch):
 
     monkeypatch.setattr(Compiled, "load", load)
     monkeypatch.setattr(machine, "OFTEN", 2000)
-    monkeypatch.setattr(machine, "_watched", weakref.WeakSet())  # no other function comes before
+    monkeypatch.setattr(machine, "_watched", weakref.WeakKeyDictionary())  # no other function comes before
     function = scalarised(lambda x: lax.fori_loop(0, 100, lambda k, x: jnp.cos(x @ x.T / 3) + k / 7, x))
     x = numbers(3, 3)
     first = np.asarray(function(x))

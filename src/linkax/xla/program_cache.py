@@ -11,14 +11,13 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from linkax.files import writable_folder
-from linkax.xla.memory_maps import CACHES, COMPILING
+from linkax.xla.memory_maps import COMPILING
 from linkax.xla.users_line import warn
 from scalarjit import keep_in
-from scalarjit.kept_programs import FOUND, forget
+from scalarjit.kept_programs import FOUND
 
 ASKED = "/jax/compilation_cache/compile_requests_use_cache"  # what JAX tells its listeners of a program
 FOUND_OR_KEPT = (FOUND, "/jax/compilation_cache/cache_misses")
-CACHES.append(forget)
 LONG = 1.0  # time to compile that is worth a warning [s]
 
 _thread = threading.local()
