@@ -18,7 +18,10 @@ def whole_jacobian(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @partial(jax.custom_jvp, nondiff_argnums=(0,))
     def whole(static, *arrays):
-        return partial(function, static)(*arrays)
+        # From here JAX takes which results have a row for each member of a batch, and it fails where the changes of
+        # others have one (https://github.com/jax-ml/jax/issues/16374). So all of them depend on all arrays.
+        of_all = jnp.sum(ravel_pytree(arrays)[0])
+        return jax.tree.map(lambda result: jnp.where(True, result, of_all), function(static, *arrays))
 
     def rule(static, arrays, tangents):
         moves = [type(change) is not jax.custom_derivatives.SymbolicZero for change in tangents]
