@@ -6,7 +6,7 @@ from scalarjit import functions, kept_programs, parts, traced, transform
 def clear_caches() -> None:
     """Let go of what is known of functions, and of programs. What is used again is traced and written again.
 
-    What is compiled stays, as JAX may call it as long as the process lives: a tenth of all.
+    What JAX calls after that is compiled again, of text that is packed meanwhile.
     """
     functions.FUNCTIONS.clear()
     traced.clear()

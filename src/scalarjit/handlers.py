@@ -1,6 +1,9 @@
 """What JAX calls: functions by XLA's interface for foreign functions, for one member or for a batch."""
 
 import ctypes
+import pickle
+import threading
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,9 +17,14 @@ from scalarjit.machine import compiled
 from scalarjit.memory import ALIGNMENT
 from scalarjit.units import Unit, unit
 
+# Code is counted while it runs, and `cell` is null where it has been let go of; then `again` compiles it.
 HANDLER = """
 @cell = global ptr null
+@running = global i64 0
+@again = global ptr null
 @packing = global ptr null
+@no_code = constant [{no_code_length} x i8] c"{no_code}\\00"
+@no_memory = constant [{no_memory_length} x i8] c"{no_memory}\\00"
 declare ptr @malloc(i64)
 declare void @free(ptr)
 define ptr @handler(ptr %frame) {{
@@ -34,23 +42,58 @@ store i32 0, ptr %major
 store i32 {minor}, ptr %minor
 ret ptr null
 execute:
+%others = atomicrmw add ptr @running, i64 1 seq_cst
+%kept = load atomic ptr, ptr @cell seq_cst, align 8
+%is_kept = icmp ne ptr %kept, null
+br i1 %is_kept, label %call, label %compile
+compile:
+%again = load ptr, ptr @again
+call void %again()
+%new = load atomic ptr, ptr @cell seq_cst, align 8
+%is_new = icmp ne ptr %new, null
+br i1 %is_new, label %call, label %fail
+call:
+%cell = phi ptr [%kept, %execute], [%new, %compile]
 %given = getelementptr i8, ptr %frame, i64 72
 %arguments = load ptr, ptr %given
 %wanted = getelementptr i8, ptr %frame, i64 112
 %results = load ptr, ptr %wanted
 %raw = call ptr @malloc(i64 {bytes})
+%is_room = icmp ne ptr %raw, null
+br i1 %is_room, label %begin, label %fail
+begin:
 %number = ptrtoint ptr %raw to i64
 %up = add i64 %number, {above}
 %aligned = and i64 %up, -{alignment}
 %memory = inttoptr i64 %aligned to ptr
 {columns}
-%cell = load ptr, ptr @cell
 %code = load ptr, ptr %cell
 {body}
 call void @free(ptr %raw)
+%other = atomicrmw sub ptr @running, i64 1 seq_cst
 ret ptr null
+fail:
+%message = phi ptr [@no_code, %compile], [@no_memory, %call]
+%less = atomicrmw sub ptr @running, i64 1 seq_cst
+%error = alloca [4 x i64], align 8
+store i64 28, ptr %error
+%error1 = getelementptr i8, ptr %error, i64 8
+store ptr null, ptr %error1
+%error2 = getelementptr i8, ptr %error, i64 16
+store ptr %message, ptr %error2
+%error3 = getelementptr i8, ptr %error, i64 24
+store i32 {exhausted}, ptr %error3
+%apis = getelementptr i8, ptr %frame, i64 16
+%api = load ptr, ptr %apis
+%creates = getelementptr i8, ptr %api, i64 48
+%create = load ptr, ptr %creates
+%told_error = call ptr %create(ptr %error)
+ret ptr %told_error
 }}
 """
+NO_CODE = "scalarjit: code that had been let go of does not compile again"
+NO_MEMORY = "scalarjit: no memory is left for {bytes} bytes"
+EXHAUSTED = 8  # XLA's number for resources that are used up
 NAMES = r"scalarjit_[0-9a-f]{40}"  # by which JAX calls
 MINOR = 3  # of the version 0 of XLA's interface for foreign functions that handlers are written for
 
@@ -77,27 +120,71 @@ class Handler:
 
     def register(self) -> None:
         """Tell JAX, which may call it as long as the process lives."""
-        known = self.name in registered
-        registered[self.name] = self
-        if known:
-            return
-        made = compiled(self.unit)
-        engine = loaded(kept_or_compiled(self.text, AT_ONCE))
-        for name, address in ("cell", made.cell.ctypes.data), ("packing", packing.table(self.lanes, self.sizes)):
-            ctypes.c_int64.from_address(engine.get_global_value_address(name)).value = address
-        called = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(engine.get_function_address("handler"))
-        jax.ffi.register_ffi_target(self.name, jax.ffi.pycapsule(called), platform="cpu", api_version=1)
-        _in_use.append((made, engine, called))
+        with _lock:
+            if self.name not in registered:
+                registered[self.name] = Registered(self)
+            registered[self.name].load(self)
 
 
-registered: dict[str, Handler | None] = {}  # None for those whose text has been let go of
-_in_use: list[Any] = []
+class Registered:
+    """What JAX calls by one name as long as the process lives.
+
+    Its code is let go of by `clear`, and is compiled again where JAX calls it after that.
+    """
+
+    def __init__(self, handler: Handler) -> None:
+        self._handler: Handler | bytes = handler
+        self._engine = loaded(kept_or_compiled(handler.text, AT_ONCE))
+        self._again = ctypes.CFUNCTYPE(None)(self.load)
+        self._cell, self._running = map(self._number, ("cell", "running"))
+        self._number("again").value = ctypes.cast(self._again, ctypes.c_void_p).value
+        self._number("packing").value = packing.table(handler.lanes, handler.sizes)
+        self._called = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(self._engine.get_function_address("handler"))
+        jax.ffi.register_ffi_target(handler.name, jax.ffi.pycapsule(self._called), platform="cpu", api_version=1)
+
+    def _number(self, name):
+        return ctypes.c_int64.from_address(self._engine.get_global_value_address(name))
+
+    @property
+    def handler(self) -> Handler:
+        if isinstance(self._handler, bytes):
+            return pickle.loads(zlib.decompress(self._handler))
+        return self._handler
+
+    @property
+    def has_code(self) -> bool:
+        return bool(self._cell.value)
+
+    def load(self, handler: Handler | None = None) -> None:
+        """Have its code compiled, unless it is."""
+        with _lock:
+            if not self.has_code:
+                self._handler = handler or self.handler
+                self._code = compiled(self._handler.unit)
+                self._cell.value = self._code.cell.ctypes.data
+
+    def let_go(self) -> None:
+        """Let go of its code, unless it runs; of its text, a sixth stays."""
+        with _lock:
+            if not isinstance(self._handler, bytes):
+                self._handler = zlib.compress(pickle.dumps(self._handler), 1)
+            cell = self._cell.value
+            self._cell.value = 0
+            with threading.Lock():  # a processor writes before it reads on
+                if self._running.value:
+                    self._cell.value = cell
+                else:
+                    self._code = None
+
+
+registered: dict[str, Registered] = {}
+_lock = threading.RLock()
 
 
 def clear() -> None:
-    """Let go of texts."""
-    for name in registered:
-        registered[name] = None
+    """Let go of code that does not run."""
+    for each in list(registered.values()):
+        each.let_go()
 
 
 def handler_of(function: Function, lanes: int, members: int | None = None, batched: tuple[bool, ...] = ()) -> Handler:
@@ -117,9 +204,16 @@ def handler_of(function: Function, lanes: int, members: int | None = None, batch
         more = 0
     else:
         body, sizes, more = _over_groups(function, lanes, members, batched, passed, code.memory)
+    bytes = code.memory + more + ALIGNMENT
+    no_memory = NO_MEMORY.format(bytes=bytes)
     text = HANDLER.format(
+        no_code=NO_CODE,
+        no_code_length=len(NO_CODE) + 1,
+        no_memory=no_memory,
+        no_memory_length=len(no_memory) + 1,
+        exhausted=EXHAUSTED,
         minor=MINOR,
-        bytes=code.memory + more + ALIGNMENT,
+        bytes=bytes,
         above=ALIGNMENT - 1,
         alignment=ALIGNMENT,
         columns="\n".join(columns),
@@ -172,7 +266,7 @@ def _over_groups(function, lanes, members, batched, passed, memory):
     begin += [
         "br label %groups",
         "groups:",
-        "%g = phi i64 [0, %execute], [%g1, %group]",
+        "%g = phi i64 [0, %begin], [%g1, %group]",
         f"%any = icmp slt i64 %g, {members}",
         "br i1 %any, label %group, label %end",
         "group:",

@@ -123,9 +123,7 @@ def _new(place, lowered):
         return None
     blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), lowered.out_info).tree
     names = [] if handlers is None else sorted(set(re.findall(handlers.NAMES, text)))
-    called = [handlers.registered[name] for name in names]
-    if None in called:  # their text has been let go of
-        return None
+    called = [handlers.registered[name].handler for name in names]
 
     def compile():
         _listen()

@@ -3,6 +3,7 @@
 import atexit
 import threading
 import weakref
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -82,21 +83,24 @@ def _end() -> None:
 
 def _improve() -> None:
     """Compile again what has been called often, with all that it calls."""
-    while not _stop.wait(PAUSE):
-        often = _called_often()
-        if often is None:
-            continue
-        made, unit = often
-        text = unit.together()
-        try:
-            code = files.read(file_of(text, CARE)) or _compiled_beside(text)
-        except (OSError, EOFError):  # no process may be started here, or it has ended
-            return
-        if _stop.is_set():
-            return
-        made.load(code)
-        for part in unit.all_parts():  # which it calls no longer
-            _compiled[part.key].cell[1] = 0
+    with suppress(OSError, EOFError):  # no process may be started here, or it has ended
+        while not _stop.wait(PAUSE):
+            _improve_one()
+
+
+def _improve_one():
+    often = _called_often()
+    if often is None:
+        return
+    made, unit = often
+    text = unit.together()
+    code = files.read(file_of(text, CARE)) or _compiled_beside(text)
+    if _stop.is_set():
+        return
+    made.load(code)
+    for part in unit.all_parts():  # which it calls no longer
+        if callee := _compiled.get(part.key):
+            callee.cell[1] = 0
 
 
 def _called_often() -> tuple[Compiled, Unit] | None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox.internal as eqxi
 import jax
@@ -120,8 +121,8 @@ def graphs():
     return sum(isinstance(each, Graph) and len(each.names) > 0 for each in gc.get_objects())
 
 
-def test_what_is_compiled_stays_without_what_it_was_made_of():
-    """Graphs take four times the memory of their text; of texts and all else, `clear_caches` lets go."""
+def test_what_is_let_go_of_is_compiled_again_where_it_is_called():
+    """Graphs take four times the memory of their text; of texts, code and all else, `clear_caches` lets go."""
     function = lambda x: lax.fori_loop(0, 10, lambda k, x: jnp.cos(x @ x.T / 3) + k / 7, x)
     before = graphs()
     compiled = jax.jit(scalarised(function))
@@ -129,11 +130,50 @@ def test_what_is_compiled_stays_without_what_it_was_made_of():
     first = compiled(x)
     assert graphs() == before
     clear_caches()
-    assert not any(handlers.registered.values())
+    assert not any(each.has_code for each in handlers.registered.values())
     np.testing.assert_array_equal(compiled(x), first)
+    assert sum(each.has_code for each in handlers.registered.values()) == 1
+    clear_caches()
     compiled.clear_cache()
     np.testing.assert_array_equal(compiled(x), first)
     np.testing.assert_allclose(jax.vmap(compiled)(several), jax.vmap(function)(several), atol=1e-14)
+
+
+def test_code_that_runs_is_not_let_go_of():
+    def function(x, passes):
+        return lax.fori_loop(0, passes, lambda k, x: jnp.cos(x @ x.T / 3) + k / 7, x)
+
+    compiled = jax.jit(scalarised(function))
+    first = compiled(numbers(3, 3), 1_000_000)
+    with ThreadPoolExecutor() as pool:
+        runs = [pool.submit(compiled, numbers(3, 3), 1_000_000) for _ in range(3)]
+        while not all(run.done() for run in runs):
+            clear_caches()
+    for run in runs:
+        np.testing.assert_array_equal(run.result(), first)
+
+
+FAILED = ValueError, jax.errors.JaxRuntimeError  # JAX raises one or the other
+
+
+def test_code_that_cannot_be_compiled_again_is_an_error(monkeypatch):
+    compiled = jax.jit(scalarised(lambda x: jnp.sin(x) / 3 + x))
+    assert compiled(0.0) == 0.0
+    clear_caches()
+    reasons = []
+    with monkeypatch.context() as patch:
+        patch.setattr(handlers, "compiled", None)
+        patch.setattr(sys, "unraisablehook", reasons.append)
+        with pytest.raises(FAILED, match="code that had been let go of does not compile again"):
+            compiled(0.0).block_until_ready()
+    assert [reason.exc_type for reason in reasons] == [TypeError]
+    assert compiled(0.0) == 0.0
+
+
+def test_memory_that_is_not_there_is_an_error(monkeypatch):
+    monkeypatch.setattr(handlers, "HANDLER", handlers.HANDLER.replace("@malloc(i64 {bytes})", "@malloc(i64 -1)"))
+    with pytest.raises(FAILED, match="no memory is left for [0-9]+ bytes"):
+        jax.jit(scalarised(lambda x: jnp.sin(x) / 5 + x))(0.0).block_until_ready()
 
 
 def copies_in_loops(region, inside=False):
