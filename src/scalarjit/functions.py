@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from scalarjit.arrays import NONE, Array, Entries, Stored, constants_of
+from scalarjit.arrays import NONE, Array, Delayed, Entries, Stored, constants_of
 from scalarjit.function import Function, Result
 from scalarjit.graph import Buffer, Graph
 from scalarjit.traced import check
@@ -83,6 +83,8 @@ def function_of(closed: ClosedJaxpr, known: Iterable[np.ndarray | None]) -> Func
     number = 0
     written: set[int] = set()
     for array in outputs:
+        if isinstance(array, Delayed):
+            array = array.stored()  # which tells constants
         known_ = constants_of(array)
         of_argument = next((k for k, given in enumerate(inputs) if given is array), None)
         result = Result(array.shape, array.dtype, known_, of_argument)

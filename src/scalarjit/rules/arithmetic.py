@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from scalarjit.arrays import Array, Delayed, Entries, Updated, by_entry, every, known_of
+from scalarjit.arrays import MANY, Array, Delayed, Entries, Updated, by_entry, every, known_of
 from scalarjit.graph import Graph, constant, is_one, is_zero
-from scalarjit.rules.rule import MANY, SMALL, UNROLLED, has_entries, made, rule
+from scalarjit.rules.rule import SMALL, UNROLLED, has_entries, made, rule
 
 SAME = [
     "add",

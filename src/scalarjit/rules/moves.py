@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from scalarjit.arrays import (
+    MANY,
     Array,
     Delayed,
     Entries,
@@ -22,7 +23,7 @@ from scalarjit.arrays import (
     unravelled,
 )
 from scalarjit.graph import as_scalar, constant, constants
-from scalarjit.rules.rule import MANY, UNROLLED, has_entries, made, rule
+from scalarjit.rules.rule import UNROLLED, has_entries, made, rule
 
 
 def _moved(graph, out, array, place: Callable[[tuple[Number, ...]], tuple[Number, ...]]) -> Array:
@@ -48,7 +49,18 @@ def reshaped(graph, name, out, arrays, **params):
             return tuple(index[next(left)] if size != 1 else 0 for size in array.shape)
 
     else:
-        place = lambda index: unravelled(ravelled(index, out.shape), array.shape)
+        same = 0  # innermost axes that stay
+        for size, own in zip(reversed(out.shape), reversed(array.shape), strict=False):
+            if size != own:
+                break
+            same += 1
+        of_out = out.shape[: len(out.shape) - same]
+        of_array = array.shape[: len(array.shape) - same]
+
+        def place(index):
+            outer = unravelled(ravelled(index[: len(of_out)], of_out), of_array)
+            return (*outer, *index[len(of_out) :])
+
     return made(
         graph,
         out.shape,

@@ -8,6 +8,7 @@ import numpy as np
 from jax.lax import GatherScatterMode
 
 from scalarjit.arrays import (
+    MANY,
     Array,
     Entries,
     Number,
@@ -23,7 +24,7 @@ from scalarjit.arrays import (
 )
 from scalarjit.graph import INDEX, Index, Store, as_scalar, constant, number_of
 from scalarjit.rules.moves import sliced
-from scalarjit.rules.rule import MANY, has_entries, made, rule, written
+from scalarjit.rules.rule import has_entries, made, rule, written
 
 
 def _starts(graph, arrays, sizes, shape):

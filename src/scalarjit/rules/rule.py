@@ -6,13 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from scalarjit.arrays import Array, Delayed, Entries, Stored, every
+from scalarjit.arrays import MANY, Array, Delayed, Entries, Stored, every
 from scalarjit.graph import Buffer, Graph
 
 SMALL = 16  # entries of an array that are always computed one by one
-# Entries up to which it is looked at how many of them differ, and are not constants. First results of a row of 40
-# four-bars take 19 s with these, 28 s with 8192, and runs as long.
-MANY = 2000
 UNROLLED = 400  # operations of one primitive that are written one by one
 
 Rule = Callable[..., Any]

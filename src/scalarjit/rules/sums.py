@@ -6,9 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from scalarjit.arrays import Entries, Number, Stored, are_known, by_entry, every, nested, ravelled, unravelled
+from scalarjit.arrays import (
+    LINE,
+    MANY,
+    Entries,
+    Number,
+    Stored,
+    are_known,
+    by_entry,
+    every,
+    nested,
+    ravelled,
+    unravelled,
+)
 from scalarjit.graph import INDEX, Buffer, Graph, Store, as_scalar, constant, constants, number_of
-from scalarjit.rules.rule import MANY, SMALL, UNROLLED, has_entries, made, rule, written
+from scalarjit.rules.rule import SMALL, UNROLLED, has_entries, made, rule, written
 
 PASSES = 8  # of a sum in a loop that are written one by one
 TILE = 8  # entries of a row of a product that are added up at once
@@ -227,7 +239,8 @@ def _dot(graph, name, out, arrays, *, dimension_numbers, **params):
         terms = count if few is None else few[1].shape[-1]
         return folded(graph, terms, constant(0, out.dtype), term, entries and are_known(index))
 
-    if entries or few is not None or math.prod(out.shape) <= SMALL:
+    is_short = count <= PASSES and bool(out.shape) and out.shape[-1] <= LINE
+    if entries or few is not None or math.prod(out.shape) <= SMALL or is_short:
         return made(graph, out.shape, out.dtype, element if entries else by_entry(element), entries=entries)
     return written(graph, out, lambda buffer: _in_tiles(graph, out, inner, added, buffer))
 
