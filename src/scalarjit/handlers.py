@@ -6,7 +6,6 @@ import threading
 import zlib
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import jax
 
@@ -137,7 +136,7 @@ class Registered:
         self._engine = loaded(kept_or_compiled(handler.text, AT_ONCE))
         self._again = ctypes.CFUNCTYPE(None)(self.load)
         self._cell, self._running = map(self._number, ("cell", "running"))
-        self._number("again").value = ctypes.cast(self._again, ctypes.c_void_p).value
+        self._number("again").value = ctypes.cast(self._again, ctypes.c_void_p).value or 0
         self._number("packing").value = packing.table(handler.lanes, handler.sizes)
         self._called = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(self._engine.get_function_address("handler"))
         jax.ffi.register_ffi_target(handler.name, jax.ffi.pycapsule(self._called), platform="cpu", api_version=1)

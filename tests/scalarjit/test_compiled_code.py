@@ -172,7 +172,7 @@ def test_code_that_cannot_be_compiled_again_is_an_error(monkeypatch):
 
 def test_memory_that_is_not_there_is_an_error(monkeypatch):
     monkeypatch.setattr(handlers, "HANDLER", handlers.HANDLER.replace("@malloc(i64 {bytes})", "@malloc(i64 -1)"))
-    with pytest.raises(FAILED, match="no memory is left for [0-9]+ bytes"):
+    with pytest.raises(FAILED, match=r"no memory is left for [0-9]+ bytes"):
         jax.jit(scalarised(lambda x: jnp.sin(x) / 5 + x))(0.0).block_until_ready()
 
 

@@ -41,34 +41,32 @@ def reshaped(graph, name, out, arrays, **params):
     if isinstance(array, Stored):
         known = None if array.known is None else array.known.reshape(out.shape)
         return Stored(graph, out.shape, array.buffer, known)
-    if [size for size in out.shape if size != 1] == [size for size in array.shape if size != 1]:
-        kept = [axis for axis, size in enumerate(out.shape) if size != 1]
-
-        def place(index):
-            left = iter(kept)
-            return tuple(index[next(left)] if size != 1 else 0 for size in array.shape)
-
-    else:
-        same = 0  # innermost axes that stay
-        for size, own in zip(reversed(out.shape), reversed(array.shape), strict=False):
-            if size != own:
-                break
-            same += 1
-        of_out = out.shape[: len(out.shape) - same]
-        of_array = array.shape[: len(array.shape) - same]
-
-        def place(index):
-            outer = unravelled(ravelled(index[: len(of_out)], of_out), of_array)
-            return (*outer, *index[len(of_out) :])
-
+    same_sizes = [size for size in out.shape if size != 1] == [size for size in array.shape if size != 1]
+    place = _past_unit_axes if same_sizes else _before_reshape
     return made(
         graph,
         out.shape,
         out.dtype,
-        lambda index: array.at(place(index)),
+        lambda index: array.at(place(index, out.shape, array.shape)),
         is_steady=array.is_steady,
         entries=has_entries(array),
     )
+
+
+def _past_unit_axes(index, out, shape):
+    left = (number for number, size in zip(index, out, strict=True) if size != 1)
+    return tuple(next(left) if size != 1 else 0 for size in shape)
+
+
+def _before_reshape(index, out, shape):
+    """Numbers along innermost axes stay as they are where these axes do: entries that are known are found by them."""
+    inner = 0
+    while inner < min(len(out), len(shape)) and out[-1 - inner] == shape[-1 - inner]:
+        inner += 1
+    of_out = out[: len(out) - inner]
+    of_shape = shape[: len(shape) - inner]
+    outer = unravelled(ravelled(index[: len(of_out)], of_out), of_shape)
+    return (*outer, *index[len(of_out) :])
 
 
 @rule("transpose")
