@@ -103,7 +103,8 @@ class Run(eqx.Module):
                 f"{stops[0].display_name} needs steps that end where an impact happens, and stepsize_controller is "
                 f"{options.controller!r}; leave it out, or give a linkax.JointLimit or Contact in place of the impact"
             )
-        flat, state, t0, accuracy = cast((with_known_entries(mechanism), state, t0, accuracy), dtype)
+        given = with_known_entries(mechanism), state, t0, accuracy
+        flat, state, t0, accuracy = (cast(each, dtype) for each in given)
         return Run(flat, state, t0, t1, formulation, accuracy, saves_times(options.saveat), Flat.of(options))
 
     @staticmethod
@@ -212,9 +213,14 @@ def saves_states(saveat: diffrax.SaveAt) -> bool:
 
 
 def cast(tree: Tree, dtype: np.dtype) -> Tree:
-    """A pytree with its numbers in a floating-point type."""
+    """A pytree with its numbers in a floating-point type; itself where they are, so that what is kept of it is found."""
+    leaves, treedef = jax.tree.flatten(tree)
     real = lambda leaf: isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating)
-    return jax.tree.map(lambda leaf: leaf.astype(dtype) if real(leaf) and leaf.dtype != dtype else leaf, tree)
+    is_other = [real(leaf) and leaf.dtype != dtype for leaf in leaves]
+    if not any(is_other):
+        return tree
+    found = [leaf.astype(dtype) if other else leaf for leaf, other in zip(leaves, is_other, strict=True)]
+    return jax.tree.unflatten(treedef, found)
 
 
 def _with_functions(saveat, event):
