@@ -13,6 +13,7 @@ LINE = 9  # entries of the innermost axes, such as those of a rotation, up to wh
 # Entries of an array up to which it is looked at which of them are constants, and how many differ. First results of a
 # row of 40 four-bars take 19 s with these, 28 s with 8192, and runs as long.
 MANY = 2000
+FEW = 8  # constants among the entries of an array that are written one by one
 
 NONE = np.int64(2**62)  # in place of a scalar that is not known
 
@@ -204,15 +205,25 @@ class Entries(Array):
         return self.ids
 
     def stored(self) -> "Stored":
-        if self._stored is None and np.all(self.ids < 0):
-            self._stored = Stored(self.graph, self.shape, constant_buffer(self.ids, self.dtype), self.ids)
-        found = super().stored()
-        found.known = self.ids
-        return found
+        if self._stored is None:
+            key = self.ids.tobytes(), self.dtype
+            buffer = next((region.arrays[key] for region in self.home.and_around() if key in region.arrays), None)
+            if buffer is None:
+                is_constant = np.all(self.ids < 0)
+                buffer = constant_buffer(self.ids, self.dtype) if is_constant else super().stored().buffer
+                self.home.arrays[key] = buffer
+            self._stored = Stored(self.graph, self.shape, buffer, self.ids)
+        return self._stored
 
     def write(self, buffer: Buffer, *, blended: bool = False) -> None:
+        flat = self.ids.ravel()
+        others = np.arange(self.size)
+        if np.count_nonzero(flat < 0) > FEW:
+            constants = constant_buffer(np.where(flat < 0, flat, constant(0, self.dtype)), self.dtype)
+            self.graph.do(Copy(buffer, constants, blended))
+            others = np.flatnonzero(flat >= 0)
         places = _places_up_to(self.size)
-        for place, scalar in enumerate(self.ids.ravel().tolist()):
+        for place, scalar in zip(others.tolist(), flat[others].tolist(), strict=True):
             self.graph.do(Store(buffer, int(places[place]), scalar, blended))
 
 

@@ -72,11 +72,22 @@ class Buffer:
 
 @dataclass(eq=False)
 class Region:
-    """Operations and statements in their order; those of regions around it are at hand in it."""
+    """Operations and statements in their order; those of regions around it are at hand in it.
+
+    `arrays`: what is in memory, by its entries.
+    """
 
     parent: "Region | None" = None
     memo: dict[tuple, int] = field(default_factory=dict)
     items: list[Any] = field(default_factory=list)
+    arrays: "dict[tuple, Buffer]" = field(default_factory=dict)
+
+    def and_around(self) -> "Iterator[Region]":
+        """This one, and those around it, from within."""
+        region = self
+        while region is not None:
+            yield region
+            region = region.parent
 
 
 @dataclass(eq=False)
