@@ -13,6 +13,7 @@ LINE = 9  # entries of the innermost axes, such as those of a rotation, up to wh
 # Entries of an array up to which it is looked at which of them are constants, and how many differ. First results of a
 # row of 40 four-bars take 19 s with these, 28 s with 8192, and runs as long.
 MANY = 2000
+REPEATED = 64  # entries up to which an array that repeats itself is written one by one
 FEW = 8  # constants among the entries of an array that are written one by one
 
 NONE = np.int64(2**62)  # in place of a scalar that is not known
@@ -216,6 +217,10 @@ class Entries(Array):
         return self._stored
 
     def write(self, buffer: Buffer, *, blended: bool = False) -> None:
+        repeated = [axis for axis, size in enumerate(self.shape) if size > 1 and self._is_same_along(axis)]
+        if repeated and self.size > REPEATED:
+            self._repeat(repeated).write(buffer, blended=blended)
+            return
         flat = self.ids.ravel()
         others = np.arange(self.size)
         if np.count_nonzero(flat < 0) > FEW:
@@ -225,6 +230,16 @@ class Entries(Array):
         places = _places_up_to(self.size)
         for place, scalar in zip(others.tolist(), flat[others].tolist(), strict=True):
             self.graph.do(Store(buffer, int(places[place]), scalar, blended))
+
+    def _is_same_along(self, axis):
+        return bool(np.all(self.ids == self.ids.take([0], axis)))
+
+    def _repeat(self, axes):
+        """The same array, from memory that holds it once for all places along some axes."""
+        once = self.ids[tuple(slice(1) if axis in axes else slice(None) for axis in range(len(self.shape)))]
+        whole = Entries(self.graph, once, self.dtype).stored()
+        first = lambda index: tuple(0 if axis in axes else number for axis, number in enumerate(index))
+        return Delayed(self.graph, self.shape, self.dtype, lambda index: whole.at(first(index)))
 
 
 class Stored(Array):

@@ -80,6 +80,8 @@ def _transpose(graph, name, out, arrays, *, permutation):
 @rule("broadcast_in_dim")
 def _broadcast(graph, name, out, arrays, *, shape, broadcast_dimensions, **params):
     (array, *_) = arrays
+    if math.prod(shape) == array.size:  # axes of length 1 alone are new; what is in memory stays there
+        return reshaped(graph, name, out, arrays)
     if isinstance(array, Entries) and math.prod(shape) <= MANY:
         aligned = [1] * len(shape)
         for axis, size in zip(broadcast_dimensions, array.shape, strict=True):
