@@ -23,7 +23,7 @@ from scalarjit import clear_caches, handlers, machine, pieces, scalarised
 from scalarjit.compiler import CARE, object_code
 from scalarjit.emission import emitted
 from scalarjit.functions import function_of
-from scalarjit.graph import Buffer, Copy, For, Graph, If, While
+from scalarjit.graph import Buffer, Copy, For, Graph, If, Store, While
 from scalarjit.machine import Compiled
 from scalarjit.memory import Memory
 
@@ -189,6 +189,28 @@ def test_loops_keep_known_entries_of_innermost_axes():
     is_zero = np.ones((3, 3), bool)
     is_zero[:2, :2] = False
     np.testing.assert_array_equal(result.known < 0, np.broadcast_to(is_zero, (200, 3, 3)))
+
+
+def stores(region):
+    """How many entries are written one by one, those of each loop once."""
+    inner = [item.region for item in region.items if isinstance(item, For)]
+    return sum(isinstance(item, Store) for item in region.items) + sum(map(stores, inner))
+
+
+def test_what_is_in_memory_is_not_written_again():
+    """Not in another shape, nor again and again where rows are alike; constants are copied at once."""
+
+    def function(x, place):
+        mixed = jnp.concatenate([jnp.sin(x), jnp.zeros(570)])
+        alike = jnp.broadcast_to(jnp.cos(x), (20, 30))
+        rows = mixed.reshape(20, 30), mixed.reshape(20, 1, 30)[:, 0], alike
+        return [lax.dynamic_index_in_dim(array, place) for array in rows]
+
+    x = numbers(30)
+    agrees(function, x, 0)
+    agrees(jax.vmap(function, (0, None)), numbers(11, 30), 7)
+    graph = function_of(jax.make_jaxpr(function)(x, 0), [None, None]).graph
+    assert stores(graph.root) < 3 * 30 + 20
 
 
 def copies_in_loops(region, inside=False):

@@ -213,7 +213,7 @@ def saves_states(saveat: diffrax.SaveAt) -> bool:
 
 
 def cast(tree: Tree, dtype: np.dtype) -> Tree:
-    """A pytree with its numbers in a floating-point type; itself where they are, so that what is kept of it is found."""
+    """A pytree with its numbers in a floating-point type; itself where they have it, with what is kept of it."""
     leaves, treedef = jax.tree.flatten(tree)
     real = lambda leaf: isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating)
     is_other = [real(leaf) and leaf.dtype != dtype for leaf in leaves]
