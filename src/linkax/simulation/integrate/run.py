@@ -103,8 +103,8 @@ class Run(eqx.Module):
                 f"{stops[0].display_name} needs steps that end where an impact happens, and stepsize_controller is "
                 f"{options.controller!r}; leave it out, or give a linkax.JointLimit or Contact in place of the impact"
             )
-        given = with_known_entries(mechanism), state, t0, accuracy
-        flat, state, t0, accuracy = (cast(each, dtype) for each in given)
+        flat = cast(with_known_entries(mechanism), dtype)
+        state, t0, accuracy = cast((state, t0, accuracy), dtype)
         return Run(flat, state, t0, t1, formulation, accuracy, saves_times(options.saveat), Flat.of(options))
 
     @staticmethod
