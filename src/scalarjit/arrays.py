@@ -240,8 +240,11 @@ class Entries(Array):
         """The same array, from memory that holds it once for all places along some axes."""
         once = self.ids[tuple(slice(1) if axis in axes else slice(None) for axis in range(len(self.shape)))]
         whole = Entries(self.graph, once, self.dtype).stored()
-        first = lambda index: tuple(0 if axis in axes else number for axis, number in enumerate(index))
-        return Delayed(self.graph, self.shape, self.dtype, lambda index: whole.at(first(index)))
+
+        def element(index):
+            return whole.at(tuple(0 if axis in axes else number for axis, number in enumerate(index)))
+
+        return Delayed(self.graph, self.shape, self.dtype, element)
 
 
 class Stored(Array):

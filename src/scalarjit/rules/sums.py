@@ -239,6 +239,7 @@ def _dot(graph, name, out, arrays, *, dimension_numbers, **params):
         terms = count if few is None else few[1].shape[-1]
         return folded(graph, terms, constant(0, out.dtype), term, entries and are_known(index))
 
+    # Short rows of short sums are computed where they are read: loops find known entries of innermost axes then.
     is_short = count <= PASSES and bool(out.shape) and out.shape[-1] <= LINE
     if entries or few is not None or math.prod(out.shape) <= SMALL or is_short:
         return made(graph, out.shape, out.dtype, element if entries else by_entry(element), entries=entries)
