@@ -15,9 +15,7 @@ from scalarjit.units import SYMBOL, Unit
 
 OFTEN = 2000  # calls after which a function is compiled with care, and passes of loops in it
 PAUSE = 0.02  # between two looks at how often functions have been called [s]
-# Characters of a function and all that it calls, up to which they are compiled again: a second or two. A crane runs no
-# faster where what is larger is compiled again by itself, heavy loops apart, which takes 140 s of a core.
-MOST = 2_000_000
+MOST = 2_000_000  # characters of a function up to which it is compiled again: some seconds
 
 _lock = threading.RLock()
 
@@ -53,7 +51,7 @@ def compiled(unit: Unit) -> Compiled:
             loops = [kept_or_compiled(unit.loops, HEAVY_LOOPS)] if unit.loops else []
             made.load(kept_or_compiled(unit.text, AT_ONCE), *loops)
             _compiled[unit.key] = made
-            if unit.size <= MOST:
+            if unit.own_size <= MOST:
                 _watch(made, unit)
         return made
 
@@ -82,7 +80,7 @@ def _end() -> None:
 
 
 def _improve() -> None:
-    """Compile again what has been called often, with all that it calls."""
+    """Compile again what has been called often."""
     with suppress(OSError, EOFError):  # no process may be started here, or it has ended
         while not _stop.wait(PAUSE):
             _improve_one()
@@ -93,12 +91,12 @@ def _improve_one():
     if often is None:
         return
     made, unit = often
-    text = unit.together()
+    text = unit.text_together()
     code = files.read(file_of(text, CARE)) or _compiled_beside(text)
     if _stop.is_set():
         return
     made.load(code)
-    for part in unit.all_parts():  # which it calls no longer
+    for part in unit.together:  # which are called no longer, or not counted
         if callee := _compiled.get(part.key):
             callee.cell[1] = 0
 

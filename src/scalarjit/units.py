@@ -12,6 +12,7 @@ from scalarjit.memory import ALIGNMENT
 
 SYMBOL = "scalars"
 ON_STACK = 1 << 14  # bytes of a function's own memory: LLVM keeps in registers what is there, and stacks hold some MB
+MOST_TOGETHER = 1_000_000  # characters of a function and all that it calls, up to which they are compiled as one
 # As `emission` writes them.
 HEAD = re.compile(r"define void (@\w+\(.*)ptr %memory, ptr %cell\) nounwind (.*\{\nentry:\n)")
 LOOP_HEAD = re.compile(r"define void (@loop.*) nounwind (.*\{\n)")
@@ -39,7 +40,11 @@ class Unit:
     @cached_property
     def size(self) -> int:
         """Characters of its text, and those of all that it calls."""
-        return sum(len(part.text) + len(part.loops) for part in self.all_parts())
+        return sum(part.own_size for part in self.all_parts())
+
+    @property
+    def own_size(self) -> int:
+        return len(self.text) + len(self.loops)
 
     def all_parts(self) -> "list[Unit]":
         """It, and all that it calls, each once."""
@@ -52,38 +57,46 @@ class Unit:
                 waiting += part.callees
         return list(found.values())
 
-    def together(self) -> str:
-        """The text of a module with all that it calls, which LLVM puts in its place, and nothing is counted any more.
+    @cached_property
+    def together(self) -> "list[Unit]":
+        """What LLVM compiles with care as one module: it with all that it calls, or it alone where that is long.
 
         A run of the crank-slider takes 2.8 ms by code that was compiled at once, 2.1 by code that was compiled with
-        care, function by function, and 1.1 by code that was compiled together.
+        care, function by function, and 1.1 by code that was compiled together. Where it is long it is little that is
+        called for each operation: a row of 40 four-bars takes 35 ms function by function, 43 to 55 as one.
         """
+        return self.all_parts() if self.size <= MOST_TOGETHER else [self]
+
+    def text_together(self) -> str:
+        """The text of that module: LLVM puts functions in place of calls, and nothing is counted any more."""
         declarations: set[str] = set()
         lines = []
-        for part in self.all_parts():
-            for line in part._within(part is self).split("\n"):
+        for part in self.together:
+            for line in self._with(part).split("\n"):
                 if not line.startswith("declare"):
                     lines.append(line)
                 elif not line.startswith("declare void @loop"):  # which are here
                     declarations.add(line)
         return "\n".join([*sorted(declarations), *lines])
 
-    def _within(self, is_root):
-        """Its text among those of others."""
-        text = COUNTED.sub("", f"{self.loops}\n{self.text}")
-        text = CALL.sub(lambda call: f"call void @{SYMBOL}{self.callees[int(call[2])].key}({call[1]})", text)
+    def _with(self, part):
+        """The text of it or of what it calls in their module."""
+        is_root = part is self
+        text = COUNTED.sub("", f"{part.loops}\n{part.text}")
+        if len(self.together) > 1:
+            text = CALL.sub(lambda call: f"call void @{SYMBOL}{part.callees[int(call[2])].key}({call[1]})", text)
         begins = "define void" if is_root else "define internal void"
         ends = "nounwind" if is_root else "nounwind alwaysinline"
         memory = "memory"
         room = ""
-        if self._own_memory <= ON_STACK:
+        if part._own_memory <= ON_STACK:
             memory = "beyond"
-            room = f"%memory = alloca [{max(self._own_memory, 1)} x i8], align {ALIGNMENT}\n"
+            room = f"%memory = alloca [{max(part._own_memory, 1)} x i8], align {ALIGNMENT}\n"
             text = BEYOND.sub("", text)
         text = HEAD.sub(rf"{begins} \1ptr %{memory}, ptr %cell) {ends} \2{room}", text)
         text = LOOP_HEAD.sub(r"define internal void \1 nounwind alwaysinline \2", text)
         # Names of what another text may have too.
-        return text if is_root else re.sub(rf"(@\w*?\.?){SYMBOL}(?!\w)", rf"\1{SYMBOL}{self.key}", text)
+        return text if is_root else re.sub(rf"(@\w*?\.?){SYMBOL}(?!\w)", rf"\1{SYMBOL}{part.key}", text)
 
 
 _units: "weakref.WeakKeyDictionary[Function, dict[int, Unit]]" = weakref.WeakKeyDictionary()
