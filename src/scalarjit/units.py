@@ -57,7 +57,7 @@ class Unit:
                 waiting += part.callees
         return list(found.values())
 
-    @cached_property
+    @property
     def together(self) -> "list[Unit]":
         """What LLVM compiles with care as one module: it with all that it calls, or it alone where that is long.
 
@@ -71,19 +71,20 @@ class Unit:
         """The text of that module: LLVM puts functions in place of calls, and nothing is counted any more."""
         declarations: set[str] = set()
         lines = []
-        for part in self.together:
-            for line in self._with(part).split("\n"):
+        parts = self.together
+        for part in parts:
+            for line in self._with(part, len(parts) > 1).split("\n"):
                 if not line.startswith("declare"):
                     lines.append(line)
                 elif not line.startswith("declare void @loop"):  # which are here
                     declarations.add(line)
         return "\n".join([*sorted(declarations), *lines])
 
-    def _with(self, part):
+    def _with(self, part, calls_within):
         """The text of it or of what it calls in their module."""
         is_root = part is self
         text = COUNTED.sub("", f"{part.loops}\n{part.text}")
-        if len(self.together) > 1:
+        if calls_within:
             text = CALL.sub(lambda call: f"call void @{SYMBOL}{part.callees[int(call[2])].key}({call[1]})", text)
         begins = "define void" if is_root else "define internal void"
         ends = "nounwind" if is_root else "nounwind alwaysinline"

@@ -19,7 +19,7 @@ from agreement import agrees, numbers
 from jax import lax
 from test_control import FUNCTIONS, SHAPES, known_for_a_while, scanned
 
-from scalarjit import clear_caches, handlers, machine, pieces, scalarised
+from scalarjit import clear_caches, handlers, machine, pieces, scalarised, units
 from scalarjit.compiler import CARE, object_code
 from scalarjit.emission import emitted
 from scalarjit.functions import function_of
@@ -57,7 +57,7 @@ def test_what_runs_often_is_compiled_again_to_the_same_bits(monkeypatch):
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_code_with_all_that_it_calls_has_the_same_bits(function, shape, monkeypatch):
-    """Alone and in vectors, with memory of its own that is on the stack, and that is too large for it."""
+    """Function by function and as one; alone and in vectors; with memory on the stack, and with too much for it."""
     registered = set()
     register = handlers.Handler.register
     monkeypatch.setattr(handlers.Handler, "register", lambda self: registered.add(self.unit) or register(self))
@@ -66,9 +66,12 @@ def test_code_with_all_that_it_calls_has_the_same_bits(function, shape, monkeypa
     one, several = ([numbers(*more, *shape, seed=seed) for seed in (0, 1)] for more in ((), (members,)))
     first = alone(*one), of_batch(*several)
     assert len(registered) == 2
-    for unit in registered:
-        machine.compiled(unit).load(object_code(unit.together(), CARE))
-    jax.tree.map(np.testing.assert_array_equal, (alone(*one), of_batch(*several)), first)
+    for most in 0, units.MOST_TOGETHER:
+        monkeypatch.setattr(units, "MOST_TOGETHER", most)
+        for part in {part.key: part for unit in registered for part in unit.all_parts()}.values():
+            assert (part.together == [part]) == (most == 0 or not part.callees)
+            machine.compiled(part).load(object_code(part.text_together(), CARE))
+        jax.tree.map(np.testing.assert_array_equal, (alone(*one), of_batch(*several)), first)
 
 
 @pytest.mark.parametrize("function", [each for each in FUNCTIONS if each not in (known_for_a_while, scanned)])
