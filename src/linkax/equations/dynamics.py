@@ -15,7 +15,7 @@ from linkax.equations.configuration import Configuration, along_speeds
 from linkax.equations.motion import Motion
 from linkax.equations.system import System
 from linkax.equations.tree_sums import along_path, expand_to_motions, over_subtree, sum_by_body
-from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs
+from linkax.linalg.static_sparse import StaticSparse, constant_product, products_of_pairs, sums_of_pairs
 from linkax.model.forces.force import Load
 from linkax.spatial.rotations import compose, rotate, transpose
 from linkax.spatial.vectors import cross, dot
@@ -44,7 +44,7 @@ def mass_matrix(configuration: Configuration) -> Float[Array, "n_v n_v"]:
 def mass_entries(configuration: Configuration) -> StaticSparse:
     """Entries of M that may differ from zero: pairs of speeds that move a common body."""
     by_bodies = configuration.system.topology.motion_column is not None
-    found = StaticSparse.whole(_mass_by_bodies(configuration)) if by_bodies else _composite_mass(configuration)
+    found = _mass_by_bodies(configuration) if by_bodies else _composite_mass(configuration)
     added = configuration.system.joint_inertia
     return found if added is None else found.plus_diagonal(added)
 
@@ -86,7 +86,7 @@ def _mass_by_bodies(configuration):
     linear = at_anchor + cross(angular, place[:, None, :])
     momentum, moment = system.mass[:, None, None] * linear, rotate(world_inertia(configuration)[:, None], angular)
     jacobian, carried = jnp.concatenate([linear, angular], axis=2), jnp.concatenate([momentum, moment], axis=2)
-    return jnp.tensordot(jacobian, carried, axes=((0, 2), (0, 2)))
+    return sums_of_pairs(np.any(moves, axis=2), jacobian, carried)
 
 
 def _onto_carrier(carrier, carried):

@@ -42,8 +42,8 @@ def sum_by_speed(topology: Topology, motions: Float[Array, "*rest n_m"]) -> Floa
     """Sum values per motion, (…, n_m), for each speed: (…, n_v)."""
     if topology.motion_column is None:
         return motions
-    onto = np.asarray(topology.motion_column)[:, None] == np.arange(topology.num_speeds)
-    return motions @ jnp.asarray(onto, motions.dtype)
+    onto = np.arange(topology.num_speeds)[:, None] == topology.motion_column
+    return jnp.moveaxis(constant_product(onto, jnp.moveaxis(motions, -1, 0)), 0, -1)
 
 
 def product_along_path(topology: Topology, relative: Float[Array, "n_b 3 3"]) -> Float[Array, "n_b+1 3 3"]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from linkax.xla.arrays import Array
 
@@ -83,6 +83,20 @@ def products_of_pairs(
         return StaticSparse(jnp.sum(a[down] * b[across], axis=-1), indices)
     indices[present] = 1 + pairs[source]
     return StaticSparse(jnp.ravel(a @ b.T), indices)
+
+
+def sums_of_pairs(has: Bool[np.ndarray, "k n"], a: Float[Array, "k n d"], b: Float[Array, "k n d"]) -> StaticSparse:
+    """The matrix of Σₖ aₖᵢ · bₖⱼ, vectors (k, n, d) each, which are zero where `has` (k, n) is False.
+
+    It has to be symmetric, as M = Σ Jᵀ I J is. Of a crane on beams it takes 18 % of the products of full matrices.
+    """
+    k, down, across = np.nonzero(has[:, :, None] & has[:, None, :] & np.tri(has.shape[1], dtype=bool))
+    pairs, of_pair = np.unique(down * has.shape[1] + across, return_inverse=True)
+    products = jnp.sum(a[k, down] * b[k, across], axis=-1)
+    indices = np.zeros(2 * has.shape[1:], dtype=int)
+    down, across = np.divmod(pairs, has.shape[1])
+    indices[down, across] = indices[across, down] = 1 + np.arange(len(pairs))
+    return StaticSparse(jnp.zeros(len(pairs), a.dtype).at[of_pair].add(products), indices)
 
 
 def _is_worth_it(read, entries):
