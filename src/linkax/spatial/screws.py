@@ -1,7 +1,7 @@
 """Rigid motions, (..., 4, 4), as exponentials of screws, (..., 6).
 
 A motion [[R, d], [0, 1]] takes a point p to R p + d; the columns of R are the rotated axes. A screw is a turn a
-and an advance b, or the matrix [[â, b], [0, 0]] of both, where â p = a × p. All functions are smooth at every
+and an advance b, which stand for the matrix [[â, b], [0, 0]], where â p = a × p. All functions are smooth at every
 argument, and made of few operations, since beams differentiate them several times.
 """
 
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.spatial.rotations import compose, transpose
+from linkax.spatial.vectors import cross, dot
 from linkax.xla.arrays import Array
 
 TERMS = 16  # enough for turns of π to rounding
@@ -21,9 +22,6 @@ TERMS = 16  # enough for turns of π to rounding
 SERIES = np.array([[(-1.0) ** k / math.factorial(2 * k + 2 + i) for i in range(2)] for k in range(TERMS)])
 
 LEVI_CIVITA = np.array([[[(i - j) * (j - k) * (k - i) / 2.0 for k in range(3)] for j in range(3)] for i in range(3)])
-GENERATORS = np.zeros((6, 4, 4))
-GENERATORS[:3, :3, :3] = -LEVI_CIVITA
-GENERATORS[[3, 4, 5], [0, 1, 2], 3] = 1.0
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -45,25 +43,34 @@ def _series_jvp(order, primals, tangents):
     return _series(order, x), _series(order + 1, x) * change[..., None]
 
 
-def screw_matrix(screw: Float[Array, "*batch 6"]) -> Float[jax.Array, "*batch 4 4"]:
-    """Write screws (..., 6) as matrices (..., 4, 4)."""
-    return jnp.tensordot(screw, jnp.asarray(GENERATORS, screw.dtype), 1)
+def bracket(first: Float[Array, "*batch 6"], second: Float[Array, "*batch 6"]) -> Float[jax.Array, "*batch 6"]:
+    """Compute the Lie bracket of screws, of their matrices X Y − Y X."""
+    (turn, advance), (second_turn, second_advance) = (jnp.split(screw, 2, axis=-1) for screw in (first, second))
+    along = cross(turn, second_advance) - cross(second_turn, advance)
+    return jnp.concatenate([cross(turn, second_turn), along], axis=-1)
 
 
-def exponential(screw: Float[Array, "*batch 4 4"]) -> Float[jax.Array, "*batch 4 4"]:
-    """Move along a constant screw, given as its matrix S (..., 4, 4), by Rodrigues' formula.
+def exponential(screw: Float[Array, "*batch 6"]) -> Float[jax.Array, "*batch 4 4"]:
+    """Move along a constant screw (..., 6), by Rodrigues' formula.
 
-    exp S = 1 + S + (1 − cos a) / a² S² + (a − sin a) / a³ S³, where a is the angle of its turn [rad].
+    R = cos a + (sin a) / a â + (1 − cos a) / a² a aᵀ and d = b + (1 − cos a) / a² a × b + (a − sin a) / a³ a × (a × b),
+    where a is the turn, or its angle [rad].
     """
-    square = compose(screw, screw)
-    # The trace is −2 a².
-    series = _series(0, -jnp.trace(square, axis1=-2, axis2=-1) / 2.0)[..., None, None]
-    return (
-        jnp.eye(4, dtype=screw.dtype)
-        + screw
-        + series[..., 0, :, :] * square
-        + series[..., 1, :, :] * compose(square, screw)
+    turn, advance = jnp.split(screw, 2, axis=-1)
+    square = dot(turn, turn)[..., None]
+    first, second = jnp.split(_series(0, square[..., 0]), 2, axis=-1)
+    across = cross(turn, advance)
+    shift = advance + first * across + second * cross(turn, across)
+    cosine = 1.0 - first * square
+    sine_by_angle = 1.0 - second * square
+    rotation = (
+        cosine[..., None] * jnp.eye(3, dtype=screw.dtype)
+        + sine_by_angle[..., None] * jnp.tensordot(turn, jnp.asarray(-LEVI_CIVITA, screw.dtype), 1)
+        + first[..., None] * (turn[..., :, None] * turn[..., None, :])
     )
+    moved = jnp.concatenate([rotation, shift[..., None]], axis=-1)
+    last = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.0, 1.0], screw.dtype), (*moved.shape[:-2], 1, 4))
+    return jnp.concatenate([moved, last], axis=-2)
 
 
 def turn_rate(change: Float[Array, "*#batch 3 3"], rotation: Float[Array, "*#batch 3 3"]) -> Float[jax.Array, "... 3"]:

@@ -19,8 +19,7 @@ from linkax.model.beams import NUM_STRAINS, Beam
 from linkax.model.bodies import BodyOrFrame, Frame
 from linkax.model.joints.joint import AbstractJoint, JointKind, RelativeMotion
 from linkax.model.terms import Term
-from linkax.spatial.rotations import compose
-from linkax.spatial.screws import exponential, screw_matrix
+from linkax.spatial.screws import bracket, exponential
 from linkax.xla.arrays import Array, Scalar, ScalarLike
 
 
@@ -38,15 +37,10 @@ def _along_element(
     0 to 1.
     """
     slope, straight = second - first, length * np.eye(NUM_STRAINS, dtype=first.dtype)[3]
-    begin, slope = screw_matrix(first + straight), screw_matrix(slope)
-    middle, slope = end * (begin + end / 2.0 * slope), end**2 * slope
-    turned = _bracket(middle, slope)
-    return exponential(middle + _bracket(turned - 20.0 * middle, slope - _bracket(middle, turned) / 60.0) / 240.0)
-
-
-def _bracket(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[jax.Array, "4 4"]:
-    """Compute the Lie bracket of screws, for motions that follow each other from left to right."""
-    return compose(second, first) - compose(first, second)
+    middle, slope = end * (first + straight + end / 2.0 * slope), end**2 * slope
+    # Motions follow each other from left to right, so that brackets are those of the series backwards.
+    turned = bracket(slope, middle)
+    return exponential(middle + bracket(slope - bracket(turned, middle) / 60.0, turned - 20.0 * middle) / 240.0)
 
 
 def _all_strains(coordinates: Float[Array, " n"], strains: tuple[int, ...]) -> Float[jax.Array, "nodes 6"]:
