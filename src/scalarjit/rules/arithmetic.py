@@ -8,7 +8,7 @@ import numpy as np
 
 from scalarjit.arrays import MANY, Array, Delayed, Entries, Updated, by_entry, every, known_of
 from scalarjit.graph import Graph, constant, is_one, is_zero
-from scalarjit.rules.rule import SMALL, UNROLLED, has_entries, made, rule
+from scalarjit.rules.rule import SMALL, UNROLLED, UNROLLED_OF_MEMORY, has_entries, made, rule
 
 SAME = [
     "add",
@@ -88,7 +88,7 @@ def _few_remain(shape, arrays):
         return True
     known = [ids for array in arrays if array.size > 1 and (ids := known_of(array)) is not None]
     counts = [np.count_nonzero(np.broadcast_to(_is_simple(ids), shape)) for ids in known if ids.size <= MANY]
-    return math.prod(shape) - max(counts, default=0) <= UNROLLED
+    return math.prod(shape) - max(counts, default=0) <= UNROLLED_OF_MEMORY
 
 
 def _is_simple(ids):

@@ -20,7 +20,7 @@ from scalarjit.arrays import (
     unravelled,
 )
 from scalarjit.graph import INDEX, Buffer, Graph, Store, as_scalar, constant, constants, number_of
-from scalarjit.rules.rule import SMALL, UNROLLED, has_entries, made, rule, written
+from scalarjit.rules.rule import SMALL, UNROLLED, UNROLLED_OF_MEMORY, has_entries, made, rule, written
 
 PASSES = 8  # of a sum in a loop that are written one by one
 TILE = 8  # entries of a row of a product that are added up at once
@@ -189,7 +189,7 @@ def _dot(graph, name, out, arrays, *, dimension_numbers, **params):
     inner = tuple(left.shape[axis] for axis in left_axes)
     count = math.prod(inner)
     products = math.prod(out.shape) * count
-    entries = products <= UNROLLED
+    entries = products <= UNROLLED_OF_MEMORY
     if (
         not entries
         and max(left.size, right.size, math.prod(out.shape)) <= MANY
