@@ -133,7 +133,9 @@ def _of_moving(mechanism, state, moving):
     """A `Linearisation` and its `Steadiness`."""
     count, history = moving.degrees_of_freedom, moving.history()
     by_places, by_rates = history.by_places[0], history.by_rates[0]
-    stiffness, damping = by_places[:count, :count], by_rates[:count, :count]
+    # Slopes along directions that are not numbers, where bodies move without mass, may be known to be zeros.
+    exists = jnp.all(jnp.isfinite(moving.basis))
+    stiffness, damping = (jnp.where(exists, each[:count, :count], jnp.nan) for each in (by_places, by_rates))
     units = jnp.zeros(0, state.q.dtype) if state.internal is None else scales(mechanism.forces, state.q.dtype)
     rates, states = moving.states(state.internal, units)
     frequencies, modes = _frequencies(moving, (stiffness + stiffness.T) / 2.0, damping)
