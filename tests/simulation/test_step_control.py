@@ -58,7 +58,7 @@ def adapt(controller, error, t0=0.0, t1=1.0, retries=0):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("step", [near(1e-3), near(follows=1e-3)], ids=["its own", "of the next step"])
 def test_a_stage_close_to_a_singular_configuration_is_moved_away(controller, step):
-    keep, next_t0, next_t1, _, (_, retries, _), _ = adapt(controller, step)
+    keep, next_t0, next_t1, _, (_, retries, *_), _ = adapt(controller, step)
     assert not keep
     assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
 
@@ -70,7 +70,7 @@ def test_an_error_from_such_a_stage_does_not_choose_the_next_try(controller):
     # A step that is not taken is not placed for the next one.
     assert adapt(controller, FAR._replace(error=errors))[2] < 0.5
     assert adapt(controller, near(follows=1e-3, errors=errors))[2] < 0.5
-    keep, next_t0, next_t1, _, (_, retries, _), _ = adapt(controller, near(1e-3, errors=errors))
+    keep, next_t0, next_t1, _, (_, retries, *_), _ = adapt(controller, near(1e-3, errors=errors))
     assert not keep
     assert (next_t0, next_t1, retries) == (0.0, 0.5, 1)
 

@@ -43,6 +43,7 @@ class StepError(NamedTuple):
     - `turns`: how fast joints turn between bodies whose force elements switch, at the faster of its ends [rad/s]; None
       without such elements.
     - `locks`: one where it leads up to where the mechanism locks, else zero: diffrax makes numbers of all of these.
+    - `solver`: the state of the solver inside before the step.
     """
 
     error: Any
@@ -52,6 +53,7 @@ class StepError(NamedTuple):
     switch: Float[Array, ""] | None = None
     turns: Float[Array, ""] | None = None
     locks: Float[Array, ""] | float = 0.0
+    solver: Any = None
 
 
 class SolverState(NamedTuple):

@@ -12,17 +12,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from linkax.simulation.integrate import diffrax_contract
-from linkax.simulation.integrate.problem import derivative
-from linkax.simulation.integrate.projected_solver import ProjectedSolver
+from linkax.simulation.integrate.integrator import InitialValueProblem, Integrator, recording, solved
 from linkax.simulation.integrate.results import RESULTS
-from linkax.simulation.integrate.step_control import MechanismControl
-from linkax.simulation.integrate.step_derivatives import (
-    InitialValueProblem,
-    Steps,
-    Trajectory,
-    cotangents_over_steps,
-    tangents_over_steps,
-)
+from linkax.simulation.integrate.step_derivatives import Trajectory, cotangents_over_steps, tangents_over_steps
+from linkax.simulation.integrate.step_record import StepRecord
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise
 from linkax.xla.primitives import primitive
@@ -31,19 +24,6 @@ NO_REVERSE = (
     "Reverse-mode derivatives of reverse-mode derivatives of a simulation do not exist. Take second derivatives "
     "forwards: jax.jacfwd(jax.jacfwd(loss)), or jax.jvp(jax.grad(loss), ...) for a Hessian times a vector."
 )
-
-
-class Integrator(eqx.Module):
-    """What `diffrax.diffeqsolve` is given beside an initial value problem."""
-
-    dt0: Any
-    saveat: diffrax.SaveAt
-    solver: ProjectedSolver
-    controller: MechanismControl
-    adjoint: diffrax.AbstractAdjoint
-    event: diffrax.Event | None
-    progress_meter: diffrax.AbstractProgressMeter
-    max_steps: int | None = eqx.field(static=True)
 
 
 class Integrated(NamedTuple):
@@ -72,46 +52,31 @@ def has_discrete_adjoint(
     return plain and explicit and event is None and max_steps is not None
 
 
-def solve_by_diffrax(ivp: InitialValueProblem, integrator: Integrator, track: bool) -> tuple[Integrated, Steps | None]:
+def solve_by_diffrax(
+    ivp: InitialValueProblem, integrator: Integrator, track: bool
+) -> tuple[Integrated, StepRecord | None]:
     """Solve an initial value problem; what derivatives there are, are those of diffrax's adjoint.
 
-    **Returns:** an `Integrated`, and its `Steps` if they are to be tracked, else None.
+    **Returns:** an `Integrated`, and the `StepRecord` if steps are to be tracked, else None.
     """
-    end, steps = diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t0=True, steps=True)
     saveat = integrator.saveat
     if ivp.saved is not None:
         saveat = eqx.tree_at(lambda s: s.subs.ts, saveat, ivp.saved)
     saveat = eqx.tree_at(
-        lambda s: (s.subs, s.solver_state),
+        lambda s: (s.subs, s.solver_state, s.controller_state),
         saveat,
-        ((saveat.subs, end, steps) if track else (saveat.subs, end), True),
+        ((saveat.subs, diffrax.SubSaveAt(t1=True)), True, track),
         is_leaf=lambda leaf: leaf is None,
     )
-    with diffrax_contract.times_in_order():
-        solution: Any = diffrax.diffeqsolve(
-            diffrax.ODETerm(derivative),
-            integrator.solver,
-            ivp.t0,
-            ivp.t1,
-            integrator.dt0,
-            ivp.y0,
-            ivp.problem,
-            saveat=saveat,
-            stepsize_controller=integrator.controller,
-            adjoint=integrator.adjoint,
-            event=integrator.event,
-            max_steps=integrator.max_steps,
-            throw=False,
-            progress_meter=integrator.progress_meter,
-        )
-    (ts, t_end, *times), (ys, y_end, *states) = solution.ts, solution.ys
+    solution = solved(ivp, recording(ivp, integrator) if track else integrator, saveat)
+    (ts, t_end), (ys, y_end) = solution.ts, solution.ys
     average = lax.stop_gradient(diffrax_contract.integral_of_distance(y_end[0]) / (t_end[0] - ivp.t0))
     closest = diffrax_contract.closest(solution)
-    tracked = Steps(times[0], states[0], solution.stats["num_accepted_steps"]) if track else None
+    record = solution.controller_state.record if track else None
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(diffrax_contract.locked(solution), RESULTS.locked, result)
     end = t_end[0], y_end[0], solution.stats, result
-    return Integrated(ts, ys, *end, closest, average, solution.interpolation), tracked
+    return Integrated(ts, ys, *end, closest, average, solution.interpolation), record
 
 
 # The same with the derivatives of `tangents_over_steps`, in both modes: of `ts`, `t_end`, `ys` and `y_end`.
@@ -120,13 +85,13 @@ integrate = eqx.filter_custom_jvp(solve_by_diffrax)
 
 @integrate.def_jvp
 def _integrate_jvp(primals, tangents):
-    """The tangents of states, and of tracked steps, which derivatives of cotangents need."""
+    """The tangents of states, and of the tracked record, which derivatives of cotangents need."""
     (ivp, integrator, track), (tangents, *_) = primals, tangents
-    integrated, steps = integrate(ivp, integrator, True)
+    integrated, record = integrate(ivp, integrator, True)
     # In one array, which is one of a batch where anything is: JAX could not transpose a batch with parts in common.
     flat, restored = ravel_pytree(tangents)
-    flat = flat + (steps.count < 0)
-    trajectory = _tangents(integrator.solver, track, ivp, steps, restored, flat)
+    flat = flat + (record.count < 0)
+    trajectory = _tangents(integrator, track, ivp, record, restored, flat)
     begin, end = materialise(ivp.t0, tangents.t0), materialise(ivp.t1, tangents.t1)
     saved = None if ivp.saved is None else materialise(ivp.saved, tangents.saved)
     row_by_row = lambda *parts: _rows(integrator.saveat.subs, *parts)
@@ -140,8 +105,7 @@ def _integrate_jvp(primals, tangents):
     )
     if not track:
         return (integrated, None), (to_integrated, None)
-    to_times = trajectory.times.at[steps.count].set(end)
-    return (integrated, steps), (to_integrated, Steps(to_times, trajectory.steps, None))
+    return (integrated, record), (to_integrated, trajectory.of_record(record))
 
 
 def _rows(sub, y0, saved, end):
@@ -154,15 +118,16 @@ def _rows(sub, y0, saved, end):
 # have a forward and a backward rule.
 
 
-def _evaluate(solver, every, ivp, steps, restored, flat):
-    return tangents_over_steps(solver, every, ivp, steps, restored(flat))
+def _evaluate(integrator, every, ivp, record, restored, flat):
+    return tangents_over_steps(integrator, every, ivp, record, restored(flat))
 
 
-def _abstract(solver, every, ivp, steps, restored, flat):
+def _abstract(integrator, every, ivp, record, restored, flat):
     n = ivp.y0.shape
     of = lambda shape: ShapedArray(shape, ivp.y0.dtype)
-    saved = None if ivp.saved is None else of(ivp.saved.shape + n)
-    shapes: Any = saved, of(n), *((of(steps.ys.shape), of(steps.ts.shape)) if every else (None, None))
+    like = record.ys, record.ts, record.starts.y, record.starts.t0
+    of_record = [of(part.shape) if every else None for part in like]
+    shapes: Any = None if ivp.saved is None else of(ivp.saved.shape + n), of(n), *of_record
     return Trajectory(*shapes)
 
 
@@ -171,14 +136,14 @@ def _jvp(primals, tangents):
 
 
 def _transpose(inputs, cotangent):
-    solver, every, ivp, steps, restored, flat = inputs
+    integrator, every, ivp, record, restored, flat = inputs
     if every:
         raise NotImplementedError(NO_REVERSE)
     tangents = jax.eval_shape(restored, flat.aval)
     wanted = jax.tree.map(lambda tangent: tangent is not None, tangents, is_leaf=lambda leaf: leaf is None)
-    flat, _ = ravel_pytree(cotangents_over_steps(solver, ivp, steps, wanted, cotangent))
+    flat, _ = ravel_pytree(cotangents_over_steps(integrator, ivp, record, wanted, cotangent))
     none = lambda tree: jax.tree.map(lambda _: None, tree)
-    return none(solver), none(every), none(ivp), none(steps), None, flat
+    return none(integrator), none(every), none(ivp), none(record), None, flat
 
 
 _tangents = primitive("discrete_adjoint", _evaluate, _abstract, _jvp, _transpose)

@@ -18,15 +18,15 @@ from linkax.formulations.formulation import AbstractFormulation
 from linkax.model.known_times import known_times
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.integrate.accuracy import Accuracy
-from linkax.simulation.integrate.discrete_adjoint import Integrated, Integrator, integrate, solve_by_diffrax
+from linkax.simulation.integrate.discrete_adjoint import Integrated, integrate, solve_by_diffrax
 from linkax.simulation.integrate.impacts import has_ended, impacts_of, is_driven_in
+from linkax.simulation.integrate.integrator import InitialValueProblem, Integrator
 from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.options import saved_times
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.projected_solver import ProjectedSolver
 from linkax.simulation.integrate.results import RESULTS, ended_well
 from linkax.simulation.integrate.run import SAVE_STATE, Run, cast, saves_states
-from linkax.simulation.integrate.step_derivatives import InitialValueProblem
 from linkax.simulation.integrate.switches import start_sides
 from linkax.simulation.start.initial_state import InitialCheck, check_initial_state
 from linkax.simulation.start.state import State

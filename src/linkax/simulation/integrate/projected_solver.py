@@ -266,7 +266,9 @@ class ProjectedSolver(diffrax.AbstractAdaptiveSolver):
             share = until_next_change(event, *fixed, within=closed, after=y1)
             switch = share if switch is None else jnp.minimum(switch, share)
         state = SolverState(inner, arrives, closest, locked)
-        of_step = StepError(errors, leaves, placement, opens, switch, turns, locked.astype(t1.dtype))
+        of_step = StepError(
+            errors, leaves, placement, opens, switch, turns, locked.astype(t1.dtype), solver_state.inner
+        )
         return y1, of_step, dense_info, state, result
 
     def corrected(

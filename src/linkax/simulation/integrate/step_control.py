@@ -1,5 +1,6 @@
 """A diffrax step size controller for motion on a manifold with singular configurations and switches."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from linkax.formulations.formulation import NEAR
 from linkax.simulation.integrate.diffrax_contract import StepError
+from linkax.simulation.integrate.step_record import LoopState, Size, StepRecord
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import ratio
 
@@ -35,11 +37,13 @@ class ControlState(NamedTuple):
 
     - `retries`: how often the step was tried again. `free`: how long the next one may be that need not end at a switch,
       or at a known time of a law; zero where the controller inside knows that.
+    - `record`: the steps so far, where derivatives need them, else None.
     """
 
     inner: Any
     retries: Int[Array, ""]
     free: Float[Array, ""]
+    record: StepRecord | None = None
 
 
 class MechanismControl(diffrax.AbstractStepSizeController):
@@ -59,13 +63,19 @@ class MechanismControl(diffrax.AbstractStepSizeController):
     After a step that leads up to where the mechanism locks there is none.
 
     - `is_undifferentiated`: see `ProjectedSolver`.
+    - `records`: the size of the record of steps; None where there is none.
+    - `start`: from where an integration goes on; None where it begins.
+    - `solver`: a state of the solver, of which a record keeps others.
     """
 
     controller: diffrax.AbstractStepSizeController
     is_undifferentiated: bool = eqx.field(static=True, default=False)
+    records: Size | None = eqx.field(static=True, default=None)
+    start: LoopState | None = None
+    solver: Any = None
 
     def wrap(self, direction: int | Array) -> "MechanismControl":
-        return MechanismControl(self.controller.wrap(direction), self.is_undifferentiated)
+        return dataclasses.replace(self, controller=self.controller.wrap(direction))
 
     @property
     def is_adaptive(self) -> bool:
@@ -96,6 +106,8 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         func: Any,
         error_order: Any,
     ) -> tuple[Any, ControlState]:
+        if self.start is not None:
+            return self.start.t1, self._recording(self.start)
         (_, v), internal = args.unpacked(y0), args.internal(y0)
         if dt0 is None and self.is_adaptive:
             # Not diffrax's choice, which would compile the equations of motion twice more.
@@ -104,9 +116,18 @@ class MechanismControl(diffrax.AbstractStepSizeController):
             dt0 = jnp.minimum(FIRST_STEP * (t1 - t0), turning)
             dt0 = lax.stop_gradient(dt0)
         alike = (v, v) if internal is None else (v, v, internal)
+        first: Any
         first, state = self.controller.init(terms, t0, t1, alike, dt0, args, func, error_order)
         first, free = self._until_known(args, t0, first, jnp.zeros_like(t0))
-        return first, ControlState(state, jnp.zeros((), int), free)
+        return first, self._recording(
+            LoopState(t0, first, y0, ControlState(state, jnp.zeros((), int), free), self.solver)
+        )
+
+    def _recording(self, start):
+        """The state of the step control from a start, with a record where one is kept."""
+        if self.records is None:
+            return start.control
+        return start.control._replace(record=StepRecord.empty(start, self.records))
 
     def adapt_step_size(
         self,
@@ -120,11 +141,22 @@ class MechanismControl(diffrax.AbstractStepSizeController):
         controller_state: ControlState,
     ) -> tuple[Bool[Array, ""], Float[Array, ""], Any, Any, ControlState, diffrax.RESULTS]:
         """Accept or reject the step, and choose the next one; `y_error` is a `StepError`."""
+        record = controller_state.record
+        before = controller_state._replace(record=None)
+        ends, next_t0, next_t1, jump, after, result = self._adapted(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, before
+        )
+        if record is not None:
+            record = record.after(LoopState(t0, t1, y0, before, y_error.solver), ends, next_t0, y1_candidate)
+        return ends, next_t0, next_t1, jump, after._replace(record=record), result
+
+    def _adapted(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """The same without a record."""
         magnitude, candidate = (_magnitudes(args, y) for y in (y0, y1_candidate))
         measured = y_error.error is not None and self.is_adaptive
         turn = args.system.fastest(args.unpacked(y0)[1]) * (t1 - t0)
         scaled = self._scaled_error(args, y_error, turn, magnitude, candidate) if measured else None
-        before, retries, free = controller_state
+        before, retries, free, _ = controller_state
         keep, next_t0, next_t1, jump, after, result = self.controller.adapt_step_size(
             t0, t1, magnitude, candidate, args, scaled, error_order, before
         )

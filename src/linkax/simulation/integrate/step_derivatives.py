@@ -16,40 +16,33 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float, Int
 
+from linkax.simulation.integrate.integrator import InitialValueProblem, Integrator, recorded_again
 from linkax.simulation.integrate.problem import Problem
 from linkax.simulation.integrate.projected_solver import ProjectedSolver
+from linkax.simulation.integrate.step_record import StepRecord
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import materialise
 
 
-class InitialValueProblem(NamedTuple):
-    """What a motion depends on: a problem, the state y0 at t0, the last time t1, and the saved times."""
-
-    problem: Problem
-    y0: Float[Array, " n"]
-    t0: Float[Array, ""]
-    t1: Float[Array, ""]
-    saved: Float[Array, " k"] | None
-
-
-class Steps(NamedTuple):
-    """The accepted steps of an integration: their ends, (s + 1, ...), the start first, and how many there are."""
-
-    ts: Float[Array, " ends"]
-    ys: Float[Array, "ends n"]
-    count: Int[Array, ""] | None
-
-
 class Trajectory(NamedTuple):
-    """The states of a motion that have derivatives: at saved times, at the end, at all steps where asked for.
+    """Tangents of the states of a motion: at saved times, at the end, and where asked for, of its `StepRecord`.
 
-    `times`: those of the steps, of which switches and known times of laws move some.
+    - `ys`, `ts`, `start_ys`, `start_ts`: those of ends of steps, and of where groups of tries begin. Switches and known
+      times of laws move some of these times.
     """
 
     saved: Float[Array, "k n"] | None
     end: Float[Array, " n"]
-    steps: Float[Array, "ends n"] | None = None
-    times: Float[Array, " ends"] | None = None
+    ys: Float[Array, "ends n"] | None = None
+    ts: Float[Array, " ends"] | None = None
+    start_ys: Float[Array, "groups n"] | None = None
+    start_ts: Float[Array, " groups"] | None = None
+
+    def of_record(self, record: StepRecord) -> StepRecord:
+        """The tangents of a record."""
+        nothing = jax.tree.map(lambda _: None, record)
+        starts = nothing.starts._replace(t0=self.start_ts, y=self.start_ys)
+        return nothing._replace(ts=self.ts, ys=self.ys, starts=starts)
 
 
 class Tableau(NamedTuple):
@@ -130,55 +123,133 @@ def _within(solver: ProjectedSolver, t0, t1, dense, t):
     return solver.interpolation_cls(t0=t0, t1=t1, **dense).evaluate(t)
 
 
+class Group(NamedTuple):
+    """The accepted steps among a group of tries: their ends, (rows + 1, ...), the start first, and how many."""
+
+    ts: Float[Array, " ends"]
+    ys: Float[Array, "ends n"]
+    count: Int[Array, ""]
+
+
+@eqx.filter_custom_jvp
+def _group(ivp: InitialValueProblem, integrator: Integrator, record: StepRecord, number: Int[Array, ""]) -> Group:
+    """The steps of a group of tries: those of the last are on record, others are made again."""
+    start = record.start(number)
+    is_last = number == record.last
+    # The last group ends where it begins: nothing is integrated.
+    again = recorded_again(ivp._replace(t1=jnp.where(is_last, start.t0, ivp.t1)), integrator, start, record.rows)
+    either = lambda on_record, other: jnp.where(is_last, on_record, other)
+    return Group(either(record.ts, again.ts), either(record.ys, again.ys), either(record.count, again.count))
+
+
+@_group.def_jvp
+def _group_jvp(primals, tangents):
+    (ivp, integrator, record, number), (ivp_dot, _, record_dot, _) = primals, tangents
+    group = _group(ivp, integrator, record, number)
+    starts, starts_dot = record.starts, record_dot.starts
+    t_dot, y_dot = materialise(starts.t0, starts_dot.t0)[number], materialise(starts.y, starts_dot.y)[number]
+    along = _Along(integrator.solver, ivp, ivp_dot, every=True, saves=False)
+    is_last = number == record.last
+    motion: Any = along.group(group, number == 0, is_last, along.begin(t_dot, y_dot, len(group.ts)))
+    of_rows = [(record.ts, record_dot.ts, motion.ts), (record.ys, record_dot.ys, motion.ys)]
+    ts_dot, ys_dot = (jnp.where(is_last, materialise(of, dot), again) for of, dot, again in of_rows)
+    return group, Group(ts_dot, ys_dot, cast(Any, None))
+
+
+class _Motion(NamedTuple):
+    """Tangents on the way: which saved time is next, of the time and the state where the next step begins, of states at
+    saved times, of the ends of the steps of the group.
+    """
+
+    j: Int[Array, ""]
+    t: Float[Array, ""]
+    y: Float[Array, " n"]
+    saved: Float[Array, "k n"] | None
+    ts: Float[Array, " ends"] | None
+    ys: Float[Array, "ends n"] | None
+
+
+class _Along(NamedTuple):
+    """Tangents of an initial value problem, taken along its steps."""
+
+    solver: ProjectedSolver
+    ivp: InitialValueProblem
+    tangents: InitialValueProblem
+    every: bool
+    saves: bool
+
+    def begin(self, t_dot, y_dot, ends: int) -> _Motion:
+        """Tangents where the first step begins, of a group of so many ends."""
+        zeros = lambda *shape: jnp.zeros(shape, y_dot.dtype)
+        rows = (zeros(ends), zeros(ends, len(y_dot))) if self.every else (None, None)
+        saved = zeros(len(cast(Any, self.ivp.saved)), len(y_dot)) if self.saves else None
+        return _Motion(jnp.zeros((), int), t_dot, y_dot, saved, *rows)
+
+    def group(self, group: Group, is_first, is_last, motion: _Motion) -> _Motion:
+        """Tangents over a group of steps."""
+        ivp, tangents = self.ivp, self.tangents
+        switching = len(ivp.problem.sides(ivp.y0)) > 0
+        known_dot = None if tangents.problem is None else tangents.problem.times
+        moving = switching or known_dot is not None
+        saved = cast(Any, ivp.saved)
+        saved_dot = cast(Any, materialise(saved, tangents.saved) if self.saves else None)
+
+        def step(sides, problem, t0, t1, y):
+            return _step(self.solver, problem, t0, t1, y, sides)
+
+        def one(carry):
+            k, y, motion = carry
+            ends = group.ts[k], group.ts[k + 1]
+            end_dot = motion.t if moving else 0.0
+            if known_dot is not None:
+                is_known, index = _known(ivp.problem, ends[1])
+                end_dot = jnp.where(is_known, known_dot[index], end_dot)
+            end_dot = jnp.where(is_last & (k == group.count - 1), materialise(ivp.t1, tangents.t1), end_dot)
+            moved = tangents.problem, motion.t, end_dot, motion.y
+            sides = ivp.problem.sides(group.ys[k + 1])
+            at = ivp.problem, *ends, y
+            ((_, y), dense), ((later, y_dot), dense_dot) = eqx.filter_jvp(functools.partial(step, sides), at, moved)
+
+            def save(carry):
+                j, found = carry
+                within = functools.partial(_within, self.solver)
+                _, value = jax.jvp(within, (*ends, dense, saved[j]), (motion.t, end_dot, dense_dot, saved_dot[j]))
+                return j + 1, found.at[j].set(value)
+
+            j, found = motion.j, motion.saved
+            if self.saves:
+                j, found = lax.while_loop(lambda carry: _reached(saved, carry[0], ends[1]), save, (j, found))
+            t_dot = later if moving else jnp.zeros_like(motion.t)
+            each = lambda rows, row: rows.at[k + 1].set(row) if self.every else None
+            return k + 1, y, _Motion(j, t_dot, y_dot, found, each(motion.ts, t_dot), each(motion.ys, y_dot))
+
+        if self.every:
+            of_start = lambda rows, row: jnp.zeros_like(rows).at[0].set(row)
+            motion = motion._replace(ts=of_start(motion.ts, motion.t), ys=of_start(motion.ys, motion.y))
+        begin = jnp.zeros((), int), group.ys[0], motion
+        return lax.while_loop(lambda carry: carry[0] < group.count, one, begin)[-1]
+
+
 def tangents_over_steps(
-    solver: ProjectedSolver, every: bool, ivp: InitialValueProblem, steps: Steps, tangents: InitialValueProblem
+    integrator: Integrator, every: bool, ivp: InitialValueProblem, record: StepRecord, tangents: InitialValueProblem
 ) -> Trajectory:
     """JVP of a run, step by step from the first: tangents of its states; None among `tangents` is zero."""
-    y0, count = ivp.y0, cast(Any, steps.count)
-    last, switching = count - 1, len(ivp.problem.sides(ivp.y0)) > 0
-    known_dot = None if tangents.problem is None else tangents.problem.times
-    moving = switching or known_dot is not None
-    saves, saved = ivp.saved is not None, cast(Any, ivp.saved)
-    saved_dot = cast(Any, materialise(saved, tangents.saved) if saves else None)
-
-    def step(sides, problem, t0, t1, y):
-        return _step(solver, problem, t0, t1, y, sides)
+    along = _Along(integrator.solver, ivp, tangents, every, saves=ivp.saved is not None)
 
     def one(carry):
-        k, j, y, moves, motion = carry
-        ends = steps.ts[k], steps.ts[k + 1]
-        begin_dot = jnp.where(k == 0, materialise(ivp.t0, tangents.t0), moves if moving else 0.0)
-        end_dot = moves if moving else 0.0
-        if known_dot is not None:
-            is_known, index = _known(ivp.problem, ends[1])
-            end_dot = jnp.where(is_known, known_dot[index], end_dot)
-        end_dot = jnp.where(k == last, materialise(ivp.t1, tangents.t1), end_dot)
-        moved = tangents.problem, begin_dot, end_dot, motion.end
-        sides = ivp.problem.sides(steps.ys[k + 1])
-        at = ivp.problem, *ends, y
-        ((_, y), dense), ((later, y_dot), dense_dot) = eqx.filter_jvp(functools.partial(step, sides), at, moved)
+        number, motion, starts = carry
+        group = _group(ivp, integrator, record, number)
+        starts = [rows.at[number].set(row) for rows, row in zip(starts, (motion.y, motion.t), strict=False)]
+        return number + 1, along.group(group, number == 0, number == record.last, motion), starts
 
-        def save(carry):
-            j, found = carry
-            within = functools.partial(_within, solver)
-            _, value = jax.jvp(within, (*ends, dense, saved[j]), (begin_dot, end_dot, dense_dot, saved_dot[j]))
-            return j + 1, found.at[j].set(value)
-
-        found = motion.saved
-        if saves:
-            j, found = lax.while_loop(lambda carry: _reached(saved, carry[0], ends[1]), save, (j, found))
-        each = lambda rows, row: rows.at[k + 1].set(row) if every else None
-        times = each(motion.times, later) if moving else motion.times
-        return k + 1, j, y, later if moving else None, Trajectory(found, y_dot, each(motion.steps, y_dot), times)
-
-    motion = Trajectory(
-        saved=jnp.zeros((len(saved), len(y0)), y0.dtype) if saves else None,
-        end=materialise(y0, tangents.y0),
-        steps=jnp.zeros_like(steps.ys).at[0].set(materialise(y0, tangents.y0)) if every else None,
-        times=jnp.zeros_like(steps.ts).at[0].set(materialise(ivp.t0, tangents.t0)) if every else None,
-    )
-    begin = jnp.zeros((), int), jnp.zeros((), int), y0, jnp.zeros_like(ivp.t0) if moving else None, motion
-    return lax.while_loop(lambda carry: carry[0] < count, one, begin)[-1]
+    first = along.begin(materialise(ivp.t0, tangents.t0), materialise(ivp.y0, tangents.y0), len(record.ts))
+    starts = [jnp.zeros_like(record.starts.y), jnp.zeros_like(record.starts.t0)] if every else []
+    begin: Any = jnp.zeros((), int), first, starts
+    _, motion, starts = lax.while_loop(lambda carry: carry[0] <= record.last, one, begin)
+    if not every:
+        return Trajectory(motion.saved, motion.y)
+    ts = motion.ts.at[record.count].set(materialise(ivp.t1, tangents.t1))
+    return Trajectory(motion.saved, motion.y, motion.ys, ts, *starts)
 
 
 def _known(problem, t):
@@ -193,35 +264,47 @@ def _reached(saved, j, t):
 
 
 def cotangents_over_steps(
-    solver: ProjectedSolver, ivp: InitialValueProblem, steps: Steps, wanted: InitialValueProblem, cotangent: Trajectory
+    integrator: Integrator,
+    ivp: InitialValueProblem,
+    record: StepRecord,
+    wanted: InitialValueProblem,
+    cotangent: Trajectory,
 ) -> InitialValueProblem:
     """VJP of a run, step by step from the last: cotangents of the leaves of `ivp` that are `wanted`."""
     problem, fixed = eqx.partition(ivp.problem, wanted.problem)
-    last, switching = cast(Any, steps.count) - 1, len(ivp.problem.sides(ivp.y0)) > 0
+    solver, switching = integrator.solver, len(ivp.problem.sides(ivp.y0)) > 0
     moving = switching or problem.times is not None
     saved = cast(Any, ivp.saved)
     saved_cotangent: Any = cotangent.saved
 
     of_problem = lambda problem: eqx.combine(problem, fixed)
 
-    def one(carry):
+    def over_group(carry):
+        number, *bars = carry
+        group = _group(ivp, integrator, record, number)
+        one = functools.partial(over_step, group, number == 0, number == record.last)
+        _, *bars = lax.while_loop(lambda carry: carry[0] >= 0, one, (group.count - 1, *bars))
+        return number - 1, *bars
+
+    def over_step(group, is_first, is_last, carry):
         k, j, y_bar, moves_bar, problem_bar, t0_bar, t1_bar, saved_bar = carry
-        ends = steps.ts[k], steps.ts[k + 1]
-        dense = _uncorrected(solver, ivp.problem, *ends, steps.ys[k])
+        begins, finishes = is_first & (k == 0), is_last & (k == group.count - 1)
+        ends = group.ts[k], group.ts[k + 1]
+        dense = _uncorrected(solver, ivp.problem, *ends, group.ys[k])
         zero = jnp.zeros_like(ends[0])
         of_step = j, zero, zero, jax.tree.map(jnp.zeros_like, dense), saved_bar
         if saved is not None:
-            of_step = _cotangents_of_saves(solver, saved, saved_cotangent, ends, dense, k == 0, of_step)
+            of_step = _cotangents_of_saves(solver, saved, saved_cotangent, ends, dense, begins, of_step)
         j, begin_bar, end_bar, dense_bar, saved_bar = of_step
-        sides = ivp.problem.sides(steps.ys[k + 1])
+        sides = ivp.problem.sides(group.ys[k + 1])
         more, begin_more, end_more, y_bar = _step_vjp(
             solver, of_problem, problem, *ends, dense, sides, (moves_bar if moving else zero, y_bar), dense_bar
         )
         problem_bar = jax.tree.map(jnp.add, problem_bar, more)
         begin_bar, end_bar = begin_bar + begin_more, end_bar + end_more
-        t0_bar = jnp.where(k == 0, begin_bar, t0_bar)
-        t1_bar = jnp.where(k == last, end_bar, t1_bar)
-        end_bar = jnp.where(k == last, 0.0, end_bar)
+        t0_bar = jnp.where(begins, begin_bar, t0_bar)
+        t1_bar = jnp.where(finishes, end_bar, t1_bar)
+        end_bar = jnp.where(finishes, 0.0, end_bar)
         if problem.times is not None:
             is_known, index = _known(ivp.problem, ends[1])
             of_times = problem_bar.times.at[index].add(jnp.where(is_known, end_bar, 0.0))
@@ -230,12 +313,12 @@ def cotangents_over_steps(
         moves_bar = begin_bar + end_bar if moving else None
         return k - 1, j, y_bar, moves_bar, problem_bar, t0_bar, t1_bar, saved_bar
 
-    zero = jnp.zeros((), steps.ts.dtype)
-    finish = steps.ts[steps.count]
+    zero = jnp.zeros((), record.ts.dtype)
+    finish = record.ts[record.count]
     count = 0 if saved is None else jnp.sum(saved <= finish)
     saved_bar = None if saved is None else jnp.zeros_like(saved)
     begin = (
-        last,
+        record.last,
         count - 1,
         cotangent.end,
         zero if moving else None,
@@ -244,7 +327,9 @@ def cotangents_over_steps(
         zero,
         saved_bar,
     )
-    *_, y_bar, _, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(lambda carry: carry[0] >= 0, one, begin)
+    *_, y_bar, _, problem_bar, t0_bar, t1_bar, saved_bar = lax.while_loop(
+        lambda carry: carry[0] >= 0, over_group, begin
+    )
     return eqx.filter(InitialValueProblem(problem_bar, y_bar, t0_bar, t1_bar, saved_bar), wanted)
 
 
