@@ -115,7 +115,7 @@ def quaternions(axes: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
     """Unit quaternions (x, y, z, w) of rotations, without a jump of sign from one to the next."""
     from scipy.spatial.transform import Rotation  # takes its time to import
 
-    found = Rotation.from_matrix(axes).as_quat()
+    found = Rotation.from_matrix(np.array(axes)).as_quat()  # a copy: SciPy 1.15 refuses arrays that are read-only
     turns = np.sign(np.sum(found[1:] * found[:-1], axis=1))
     found[1:] *= np.cumprod(np.where(turns == 0.0, 1.0, turns))[:, None]
     return found
