@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
-from linkax.model.code_walk import Key, Maker, NotComparable, NotMadeAgain, Same, Walk, is_library
+from scalarjit.code_walk import Key, Maker, NotComparable, NotMadeAgain, Same, Walk, is_library
 from scalarjit.descriptions import Undescribed, description
 
 Tree = TypeVar("Tree")

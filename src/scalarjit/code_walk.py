@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from linkax.xla.users_line import LIBRARIES
+from scalarjit.libraries import LIBRARIES
 
 Maker = Callable[[Iterator[Any]], Any]  # makes a value again from an iterator of its numbers
 
@@ -81,7 +81,7 @@ _MOST_PARTS = 100_000
 
 
 def is_library(value: Any) -> bool:
-    """Tell whether a module, class or function is of Python, an installed package or linkax, which no user changes."""
+    """Tell whether a module, class or function is in a library, which no user changes."""
     if isinstance(value, types.FunctionType):
         path = value.__code__.co_filename
     else:

@@ -1,6 +1,7 @@
 """What is said where a function or a force of a user's own is wrong: the name at fault, and the remedy that helps."""
 
 import math
+import threading
 
 import jax.numpy as jnp
 import numpy as np
@@ -61,6 +62,13 @@ def test_remedies_are_those_of_the_cause(case):
 def test_a_force_of_ones_own_is_named(kind, told):
     with pytest.raises(ValueError, match=told):
         under(kind()).power()
+
+
+def test_a_law_that_reads_what_cannot_be_compared_is_named():
+    lock = threading.Lock()
+    told = "'hinge': torque .*: its function reads lock, a _thread.lock, which cannot.*let it read numbers"
+    with pytest.raises(ValueError, match=told):
+        lx.JointTorque("hinge", lambda t, motion: 1.0 if lock else 0.0)
 
 
 def test_places_and_axes_in_ground_axes():

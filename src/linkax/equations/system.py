@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from linkax.equations.structure import Structure, structure_of
 from linkax.linalg.static_sparse import constant_product
-from linkax.model.code import OwnClasses
 from linkax.model.constraints.constraint import AbstractConstraint
 from linkax.model.forces.joint_forces import JointInertia
 from linkax.model.joints.joint import RelativeMotion
@@ -23,6 +22,7 @@ from linkax.spatial.vectors import length as length_of
 from linkax.xla.arrays import Array
 from linkax.xla.derivatives import positive_or_one
 from scalarjit import Flat
+from scalarjit.code import OwnClasses
 
 
 class System(eqx.Module):

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from linkax.model.code import Code, OwnClasses, codes_of_classes
-from linkax.model.code_walk import NotComparable
 from linkax.model.numbers import converted, number
 from linkax.xla.arrays import Array
+from scalarjit.code import Code, OwnClasses, codes_of_classes
+from scalarjit.code_walk import NotComparable
 
 # What JAX raises where a function asks a traced number for its value.
 BY_TRACING = (

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from linkax.model.code_walk import all_code, is_library
 from linkax.model.functions import Function
 from linkax.xla.arrays import Array
+from scalarjit.code_walk import all_code, is_library
 
 
 def known_times(mechanism: Any) -> Float[Array, " n"] | None:

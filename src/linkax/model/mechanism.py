@@ -10,7 +10,6 @@ import jax
 
 from linkax.model.beams import Beam
 from linkax.model.bodies import GROUND_NAME, Frame, RigidBody
-from linkax.model.code import OwnClasses
 from linkax.model.constraints.constraint import AbstractConstraint, CoordinateConstraint
 from linkax.model.description import described
 from linkax.model.discretisation import (
@@ -35,6 +34,7 @@ from linkax.model.spanning_tree import SpanningTree, spanning_tree
 from linkax.model.topology import GROUND_INDEX, Topology
 from linkax.tables import printed_as
 from scalarjit import kept_while_alive
+from scalarjit.code import OwnClasses
 
 
 @printed_as(described)

@@ -1,22 +1,12 @@
 """Warnings that point to the line of the user, however far below it they arise."""
 
-import os
 import sys
-import sysconfig
 import threading
 import warnings
 from collections.abc import Iterator
-from pathlib import Path
 from types import FrameType
 
-import jax
-import numpy as np
-
-LIBRARIES = tuple(
-    {os.fspath(Path(path).parent) + os.sep for path in (os.__file__, Path(jax.__file__).parent, np.__path__[0])}
-    | {sysconfig.get_path("purelib") + os.sep, sysconfig.get_path("platlib") + os.sep}
-    | {os.fspath(Path(__file__).parents[1]) + os.sep}
-)  # folders of Python, of installed packages and of linkax, which no user changes
+from scalarjit.libraries import LIBRARIES
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

@@ -224,7 +224,7 @@ def cast(tree: Tree, dtype: np.dtype) -> Tree:
 
 
 def _with_functions(saveat, event):
-    """The same with their functions compared by what they compute, see `linkax.model.code`."""
+    """The same with their functions compared by what they compute, see `scalarjit.code`."""
     if event is not None:
         functions = jax.tree.map(lambda function: Function(function, "event"), event.cond_fn, is_leaf=callable)
         event = eqx.tree_at(lambda e: e.cond_fn, event, functions)

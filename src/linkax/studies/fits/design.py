@@ -10,7 +10,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
-from linkax.model.code import ByValue
 from linkax.model.numbers import number, one_of, require, require_type, whole_number
 from linkax.studies.fits.design_result import Design
 from linkax.studies.fits.fit import check_output
@@ -21,6 +20,7 @@ from linkax.studies.parameters.uncertainty import Scatter, uncertainty
 from linkax.xla.arrays import Array
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import Progress, compiling
+from scalarjit.code import ByValue
 
 Criterion = Literal["D", "A", "E"]
 CRITERIA = ("D", "A", "E")

@@ -11,7 +11,6 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Bool, Int
 
-from linkax.model.code import ByValue
 from linkax.model.numbers import require_type, whole_number
 from linkax.studies.fits.fit_result import Fit, Starts, doubts
 from linkax.studies.fits.fit_search import (
@@ -34,6 +33,7 @@ from linkax.studies.parameters.parameters import as_arrays
 from linkax.studies.parameters.uncertainty import NO_INFLUENCE, uncertainty
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import compiling
+from scalarjit.code import ByValue
 
 if TYPE_CHECKING:
     from optax import GradientTransformation

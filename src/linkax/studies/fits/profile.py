@@ -10,7 +10,6 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float
 
-from linkax.model.code import ByValue
 from linkax.model.numbers import is_finite, real, require, require_type, whole_number
 from linkax.studies.fits.fit_result import Fit
 from linkax.studies.fits.fit_search import Squares, checked_tolerance, search_from_each, sensitivity
@@ -24,6 +23,7 @@ from linkax.tables import one
 from linkax.xla.arrays import Array
 from linkax.xla.users_line import warn
 from linkax.xla.waiting import compiling
+from scalarjit.code import ByValue
 
 LEVEL = 0.95  # of the interval that a profile is wide enough for
 WIDTH = 2.0  # of the values by default, in half widths of that interval

@@ -16,12 +16,12 @@ from linkax.analysis.mobility import row_names
 from linkax.equations.configuration import configure
 from linkax.equations.loops import immobile_residual, jacobian, residual
 from linkax.equations.system import system_of
-from linkax.model.code import ByValue
 from linkax.model.numbers import require_type
 from linkax.simulation.integrate.results import ENDED_WELL, result_name
 from linkax.simulation.read.passages import singular_states
 from linkax.simulation.read.solution import Solution
 from linkax.studies.parameters.free_parameters import FreeParameters
+from scalarjit.code import ByValue
 
 DEPENDENT = 1e-4  # singular value of J [rad, lengths of the mechanism] up to which a row depends on others
 OPENS = 1e-3  # part of a change of the loops, relative to it, from which it counts as one that no motion closes

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from linkax.analysis.trace import Trace
-from linkax.model.code import ByValue
 from linkax.model.numbers import require_bool, require_type, whole_number
 from linkax.simulation.integrate.results import RESULTS
 from linkax.studies.fits.fit_search import Squares, checked_tolerance, search_from_each
@@ -20,6 +19,7 @@ from linkax.studies.parameters.parameters import Bounded
 from linkax.studies.synthesis.synthesis_result import Candidate, Synthesis
 from linkax.xla.arrays import Array
 from linkax.xla.waiting import compiling
+from scalarjit.code import ByValue
 
 WEIGHTS = (1.0, 30.0, 1000.0)  # of conditions in the searches, one after the other
 MET = 1e-6  # by how much a condition may be missed

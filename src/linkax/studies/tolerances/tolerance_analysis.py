@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from linkax.model.code import ByValue
 from linkax.model.numbers import require_bool, require_type, whole_number
 from linkax.simulation.integrate.results import ENDED_WELL, REMARKS, RESULTS
 from linkax.simulation.read.solution import Solution
@@ -27,6 +26,7 @@ from linkax.studies.tolerances.tolerance_result import (
 from linkax.xla.enumerations import code, is_item
 from linkax.xla.tracing import all_concrete
 from linkax.xla.waiting import compiling
+from scalarjit.code import ByValue
 
 DEFAULT_SAMPLES = 1024  # tell a standard deviation to 2 %
 MOST_SAMPLES = 2**30  # of Sobol' points
