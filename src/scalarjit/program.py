@@ -1,8 +1,6 @@
 """The decorator: a function as a program of its own, compiled by LLVM once for each kind of arguments."""
 
-import gc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import update_wrapper
 from typing import Any, Generic, TypeVar
 
@@ -11,6 +9,7 @@ import numpy as np
 from jax.core import Tracer, eval_context
 
 from scalarjit.flat import Flat
+from scalarjit.garbage import collected_later
 from scalarjit.kept_programs import KeptProgram, are_kept, kept_program
 from scalarjit.known import known_of
 from scalarjit.transform import compiled_by_llvm
@@ -46,7 +45,7 @@ class Scalarised(Generic[Output]):
     def lower(self, *args: Any) -> Any:
         """Trace the program, to compile it before it is called, as `jax.jit(...).lower` does."""
         given = Flat.of((args, {}))
-        with _collected_later():
+        with collected_later():
             return self._kept(given) or self._jitted.lower(given)
 
     def blank_result(self, *args: Any) -> Output:
@@ -63,9 +62,10 @@ class Scalarised(Generic[Output]):
             return self._function(*args, **options)
         given = Flat.of((args, options))
         if any(isinstance(array, Tracer) for array in given.arrays):
-            return self._compute(given).tree
+            with collected_later():
+                return self._compute(given).tree
         # Not `jax.ensure_compile_time_eval`: with it JAX compiles each operation on constants by itself.
-        with eval_context(), _collected_later():
+        with eval_context(), collected_later():
             kept = self._kept(given)
             return (kept.compile() if kept else self._jitted)(given).tree
 
@@ -86,18 +86,3 @@ def _runs_operation_by_operation() -> bool:
 def scalarised(function: Callable[..., Output]) -> Scalarised[Output]:
     """Decorate a function of pytrees: compile it by LLVM, see `Scalarised`."""
     return Scalarised(function)
-
-
-@contextmanager
-def _collected_later() -> Iterator[None]:
-    """Have Python look for garbage later: while a program is traced, objects are many, and looked through in vain.
-
-    That took a fifth of the time to a first result.
-    """
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()

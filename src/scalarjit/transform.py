@@ -2,8 +2,8 @@
 
 import itertools
 import warnings
-from collections.abc import Callable
-from functools import cached_property, lru_cache, wraps
+from collections.abc import Callable, Sequence
+from functools import cached_property, lru_cache, partial, wraps
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +15,7 @@ from jax.interpreters import ad, batching, mlir
 from scalarjit.arrays import NONE
 from scalarjit.function import Function
 from scalarjit.functions import function_of
+from scalarjit.garbage import collected_later
 from scalarjit.graph import constants, value_of
 from scalarjit.known import Pattern
 from scalarjit.parts import in_parts, is_compilable
@@ -42,21 +43,34 @@ class Batch(NamedTuple):
 
 
 class Source:
-    """What is compiled: a function that JAX has traced; what has been made of it lives as long.
+    """What is compiled: a function that JAX traces; what has been made of it lives as long.
 
-    - `known`: of each argument a `Pattern` or None.
+    - `trace`: gives it as JAX has traced it. A gradient asks for no change, only for what is pulled back.
+    - `known`: of each argument a `Pattern` or None. `outs`: what is returned.
     - `change_of`: of which function this is the change, and which of its arguments move: it is linear in their changes.
     """
 
-    def __init__(self, jaxpr: ClosedJaxpr, known: Known, change_of: "tuple[Source, Moves] | None" = None) -> None:
-        self.jaxpr, self.known, self.change_of = jaxpr, known, change_of
+    def __init__(
+        self,
+        trace: Callable[[], ClosedJaxpr],
+        known: Known,
+        outs: Sequence[Any],
+        change_of: "tuple[Source, Moves] | None" = None,
+    ) -> None:
+        self._trace, self.known, self.outs, self.change_of = trace, known, outs, change_of
         self._handlers: dict[Batch | None, str] = {}
         self._jitted: dict[Batch | None, Any] = {}
         self._changes: dict[Moves, Source] = {}
         self._pulled_back: dict[Moves, Source] = {}
 
     def __repr__(self) -> str:  # JAX prints parameters of primitives where it transforms them
-        return f"<{len(self.jaxpr.eqns)} equations>"
+        return f"<{len(self.outs)} results>"
+
+    @cached_property
+    def jaxpr(self) -> ClosedJaxpr:
+        """The function as JAX has traced it."""
+        with collected_later():
+            return self._trace()
 
     @cached_property
     def function(self) -> Function:
@@ -84,17 +98,21 @@ class Source:
     def change(self, moves: Moves) -> "Source":
         """How what it returns changes, of its arguments and the changes of those that move."""
         if moves not in self._changes:
-            self._changes[moves] = Source(_change(self.jaxpr, moves), self.known, (self, moves))
+            trace = partial(_change, self.jaxpr, moves)
+            self._changes[moves] = Source(trace, self.known, list(filter(_is_real, self.outs)), (self, moves))
         return self._changes[moves]
 
     def pulled_back(self, moves: Moves) -> "Source":
         """Cotangents of arguments that move, of all arguments and the cotangents of what it returns that is real."""
         if moves not in self._pulled_back:
-            self._pulled_back[moves] = Source(_pulled_back(self.jaxpr, moves), self.known)
+            trace = partial(_pulled_back, self.jaxpr, moves)
+            self._pulled_back[moves] = Source(trace, self.known, _moving(self.jaxpr.in_avals, moves))
         return self._pulled_back[moves]
 
 
-_source = lru_cache(MOST_SOURCES)(Source)
+@lru_cache(MOST_SOURCES)
+def _source(jaxpr: ClosedJaxpr, known: Known) -> Source:
+    return Source(lambda: jaxpr, known, jaxpr.out_avals)
 
 
 def clear() -> None:
@@ -162,7 +180,7 @@ def _now(*args, source, batch):
 
 @scalarised_p.def_abstract_eval
 def _abstract(*avals, source, batch):
-    return [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in source.jaxpr.out_avals]
+    return [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in source.outs]
 
 
 def _lead(batch):
@@ -172,6 +190,7 @@ def _lead(batch):
 # Code.
 
 
+@collected_later()
 def _called(*args, source, batch):
     """A call of compiled code among XLA's operations."""
     if handlers is None:
@@ -298,7 +317,7 @@ def _jvp(args, tangents, *, source, batch):
 def _transpose(cotangents, *args, source, batch):
     of, moves = source.change_of
     given = args[: len(moves)]
-    outs = [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in of.jaxpr.out_avals if _is_real(aval)]
+    outs = [aval.update(shape=(*_lead(batch), *aval.shape)) for aval in source.outs]
     cotangents = [
         jnp.zeros(aval.shape, aval.dtype) if isinstance(cotangent, ad.Zero) else cotangent
         for cotangent, aval in zip(cotangents, outs, strict=True)

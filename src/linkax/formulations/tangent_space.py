@@ -308,6 +308,7 @@ class TangentSpace(AbstractFormulation):
         linear = linear_system(system, t, q)
         return ConstraintSplit(linear.configuration, linear.jacobian, self._split_at_once(linear))
 
+    @jit_inline
     def right_inverse(
         self, system: System, t: ScalarLike, q: Float[Array, " n_q"]
     ) -> tuple[Float[Array, "m n_v"], Float[Array, "n_v m"], Float[Array, ""]]:

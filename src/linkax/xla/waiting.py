@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from scalarjit.garbage import collected_later
+
 WORTH_TELLING = 2.0  # a shorter wait tells nothing [s]
 WIDTH = 78
 
@@ -51,7 +53,16 @@ def end_line() -> None:
 @contextmanager
 def compiling(is_first: bool = True) -> Iterator[None]:
     """Tell that programs are traced and compiled meanwhile, once that has lasted two seconds."""
-    if not (is_first and is_watched() and _telling.acquire(blocking=False)):  # one line for what is within another
+    if not is_first:
+        yield
+        return
+    with collected_later(), _telling_of_it():
+        yield
+
+
+@contextmanager
+def _telling_of_it():
+    if not (is_watched() and _telling.acquire(blocking=False)):  # one line for what is within another
         yield
         return
     done = threading.Event()

@@ -300,7 +300,7 @@ def sizes(
     places = (ts[1:-1] - ts[:-2]) / (ts[2:] - ts[:-2])
     ends = (jnp.stack([part[:-2], part[2:]], axis=1) for part in (ts, qs, vs))
     off = lambda q, *interval: speeds(system.topology, q, _on_cubic(system, *interval) - q)
-    return size(jax.vmap(off)(qs[1:-1], *ends, places)), size(vs)
+    return size(jax.vmap(scalarised(off))(qs[1:-1], *ends, places)), size(vs)
 
 
 @scalarised
@@ -326,4 +326,4 @@ def between_states(
         before, right_inverse, _ = method.right_inverse(system, ts[0], qs[0])
         return here @ right_inverse, before @ right_inverse, distance, q
 
-    return jax.vmap(at)(ts, qs, vs, places)
+    return jax.vmap(scalarised(at))(ts, qs, vs, places)

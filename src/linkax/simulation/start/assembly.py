@@ -205,7 +205,7 @@ def _assemble(flat, positions, speeds, guess, t, *, branches):
     return State(q, found.v, system.topology), remainder
 
 
-@jit_inline
+@scalarised
 def _assembled_again(given, found, branches):
     """The state that was found, for its derivatives."""
     flat, positions, speeds, guess, t = given

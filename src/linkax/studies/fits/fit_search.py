@@ -124,15 +124,15 @@ class Squares(AbstractSearch):
     ) -> tuple[Float[Array, " p"], Evaluation] | None:
         # A damping that enters by its square, or an eccentricity, has no slope at zero, and the loss may fall along it.
         # There the residual is a function of its square: a slope by that is what it gains from a short way.
-        residual, slopes = cast(Any, found)
-        sizes, move = jnp.linalg.norm(slopes, axis=0), jnp.zeros_like(z)
-        for entry in np.flatnonzero(sizes <= FAINT * jnp.maximum(jnp.max(sizes), jnp.linalg.norm(residual))):
+        residual, slopes = map(np.asarray, cast(Any, found))
+        sizes, move = np.linalg.norm(slopes, axis=0), np.zeros_like(z)
+        for entry in np.flatnonzero(sizes <= FAINT * np.maximum(np.max(sizes), np.linalg.norm(residual))):
             length = ASIDE if z[entry] + ASIDE <= self.free.ends[1][entry] else -ASIDE
             there, _ = sensitivity(self, jnp.asarray(z).at[entry].add(length), args)
-            bent = there - residual - length * slopes[:, entry]
+            bent = np.asarray(there) - residual - length * slopes[:, entry]
             if residual @ bent < 0.0:
-                move = move.at[entry].set(length * jnp.minimum(jnp.sqrt(-residual @ bent / (bent @ bent)), FURTHEST))
-        if not jnp.any(move):
+                move[entry] = length * np.minimum(np.sqrt(-residual @ bent / (bent @ bent)), FURTHEST)
+        if not np.any(move):
             return None
         moved = z + jnp.clip(move, *self.free.room(z))
         lower = sensitivity(self, moved, args)

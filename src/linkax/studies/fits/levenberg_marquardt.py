@@ -13,6 +13,7 @@ from linkax.studies.fits.bounded_least_squares import least_squares_within
 from linkax.studies.parameters.free_parameters import FreeParameters
 from linkax.studies.parameters.uncertainty import NO_INFLUENCE
 from linkax.xla.arrays import Array
+from linkax.xla.tracing import jit_inline
 
 FIRST_DAMPING = 1e-2
 LEAST_DAMPING = 1e-12
@@ -40,6 +41,7 @@ class LinearModel(NamedTuple):
     magnitudes: Float[Array, " p"]
 
     @staticmethod
+    @jit_inline
     def at(
         z: Float[Array, " p"], residual: Float[Array, " n"], slopes: Float[Array, "n p"], free: FreeParameters
     ) -> "LinearModel":
@@ -69,6 +71,7 @@ class LinearModel(NamedTuple):
         left = self.residual + self.slopes @ step
         return step, 0.5 * (self.residual @ self.residual - left @ left)
 
+    @jit_inline
     def rounding(self) -> Float[Array, ""]:
         """The loss that rounding may leave of data without noise."""
         return 0.5 * (ROUNDING * jnp.max(jnp.linalg.norm(self.slopes, axis=0) * self.magnitudes)) ** 2

@@ -13,6 +13,7 @@ from linkax.model.numbers import is_finite, real, require
 from linkax.studies.parameters.parameters import AbstractParameter
 from linkax.studies.parameters.paths import path_parts
 from linkax.xla.arrays import Array
+from linkax.xla.tracing import jit_inline
 
 NEAREST = 1e-15  # to an end of z, from where no step leads closer
 CLOSER = 0.99  # of the way to it, that one step may go
@@ -62,6 +63,7 @@ class FreeParameters(eqx.Module):
         return [value / scale for value, scale in zip(free, self.scales, strict=True)]
 
     @property
+    @jit_inline
     def start(self) -> Float[Array, " p"]:
         """z where the fit starts."""
         return ravel_pytree(self._starts())[0]
@@ -86,6 +88,7 @@ class FreeParameters(eqx.Module):
 
         return jax.vmap(self._of_values)(parts)
 
+    @jit_inline
     def _of_values(self, values):
         """z of the values of the leaves, NaN where it is not between the ends."""
         leaves = [
@@ -103,19 +106,23 @@ class FreeParameters(eqx.Module):
         return ravel_pytree(parts)[0]
 
     @property
+    @jit_inline
     def ends(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Of each entry of z, minus and plus infinity where it has none."""
         return -self._of_entries(lambda leaf: -leaf.ends[0]), self._of_entries(lambda leaf: leaf.ends[1])
 
     @property
+    @jit_inline
     def longest(self) -> Float[Array, " p"]:
         """Largest change of each entry of z in one step."""
         return self._of_entries(lambda leaf: leaf.longest)
 
+    @jit_inline
     def magnitudes(self, z: Float[Array, " p"]) -> Float[Array, " p"]:
         """Of each entry of z, which a change of it is small or large against: of a logarithm at least one."""
         return jnp.maximum(jnp.abs(z), jnp.where(jnp.isfinite(self.longest), 1.0, 0.0))
 
+    @jit_inline
     def room(self, z: Float[Array, " p"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Least and largest change of each entry of z in one step: not to an end, and no longer than the longest."""
         lower, upper = self.ends
@@ -143,6 +150,7 @@ class FreeParameters(eqx.Module):
         """Number of entries of `prior`."""
         return sum(scale.size for scale, leaf in zip(self.scales, self.leaves, strict=True) if has_prior(leaf))
 
+    @jit_inline
     def params(self, z: Float[Array, " p"]) -> Any:
         """The argument of the user's function, at z."""
         free = [part * scale for part, scale in zip(self._parts(z), self.scales, strict=True)]
@@ -156,6 +164,7 @@ class FreeParameters(eqx.Module):
         """z of numbers in the structure of `params`; NaN or infinite where they are out of bounds."""
         return self._of_values(self.structure.flatten_up_to(params))
 
+    @jit_inline
     def vector(self, z: Float[Array, " p"]) -> Float[Array, " n"]:
         """All numbers of `params(z)`."""
         return ravel_pytree(self.params(z))[0]

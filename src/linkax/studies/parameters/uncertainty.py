@@ -1,6 +1,6 @@
 """Estimate the uncertainty of fitted parameters."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +8,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
-from linkax.linalg.pivoted_qr import pivoted_qr
 from linkax.studies.parameters.free_parameters import FreeParameters
 from linkax.xla.arrays import Array
+from linkax.xla.tracing import jit_inline
 
 NO_INFLUENCE = 1e-10  # sensitivity of a parameter, relative to the largest, up to which it has no influence
 DEPENDENT = 1e-8  # diagonal entry of R, relative to the largest, up to which it is rounding of the derivatives
@@ -133,8 +133,11 @@ class _Triangle(NamedTuple):
         norms = np.linalg.norm(slopes, axis=0)
         matters = norms > NO_INFLUENCE * np.max(norms, initial=0.0)
         scale = np.where(matters, norms, 1.0)
-        square = np.linalg.qr(np.where(matters, slopes / scale, 0.0), mode="r")
-        _, r, order = (np.asarray(part) for part in pivoted_qr(jnp.asarray(square)))
+        from scipy import linalg  # takes its time to import
+
+        scaled = np.where(matters, slopes / scale, 0.0)
+        r, order = cast(Any, linalg.qr(scaled, mode="r", pivoting=True, check_finite=False))
+        r = r[: len(order)]
         diagonal = np.abs(np.diagonal(r))
         rank = int(np.sum(diagonal > DEPENDENT * max(diagonal[0], np.finfo(float).tiny)))
         return _Triangle(r, order, rank, scale)
@@ -153,6 +156,11 @@ def leverages(slopes: Float[np.ndarray, "n p"]) -> Float[np.ndarray, " n"]:
     triangle = _Triangle.of(slopes)
     columns = triangle.order[: triangle.rank]
     return np.sum((slopes[:, columns] / triangle.scale[columns] @ triangle.inverse) ** 2, axis=1)
+
+
+@jit_inline
+def _slopes_of_params(free, z):
+    return jax.jacfwd(free.vector)(z)
 
 
 def uncertainty(
@@ -191,7 +199,7 @@ def uncertainty(
     unseen[order[:rank]] = -inverse @ r[:rank, rank:]
     unseen[order[rank:]] = np.eye(len(order) - rank)
     lost = np.any(np.abs(unseen) > INVOLVED, axis=1)
-    slopes_of_params = np.asarray(jax.jacfwd(free.vector)(z))
+    slopes_of_params = np.asarray(_slopes_of_params(free, z))
     covariance = slopes_of_params @ of_free @ slopes_of_params.T
     undetermined = _undetermined(slopes_of_params, unseen, scale)
     covariance[undetermined, undetermined] = np.inf
