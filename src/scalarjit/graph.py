@@ -7,6 +7,7 @@ of their graph. So arrays of scalars are arrays of integers, which NumPy reshape
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from scalarjit.operations import BOOL, OPERATIONS
 
 INDEX = np.dtype(np.int64)
+FEW = 16  # constants that are looked for one by one faster than sorted
 
 # Constants, of which number −1 − k is the k-th.
 _values: list[np.generic] = []
@@ -38,6 +40,9 @@ def constant(value: Any, dtype: np.dtype = INDEX) -> int:
 def constants(array: np.ndarray) -> np.ndarray:
     """Give the scalars of an array of constants."""
     array = np.asarray(array)
+    if array.size <= FEW:
+        scalars = [constant(value, array.dtype) for value in array.ravel()]
+        return np.array(scalars, np.int64).reshape(array.shape)
     different, places = np.unique(
         array.view(f"u{array.itemsize}") if array.dtype.kind == "f" else array, return_inverse=True
     )
@@ -195,7 +200,7 @@ class Graph:
             if kind == "load":
                 return self.new(name, operands, what.dtype)
             return self._converted(what, operands[0])
-        if all(operand < 0 for operand in operands):
+        if max(operands) < 0:
             with np.errstate(all="ignore"):
                 value = OPERATIONS[name].compute(*map(value_of, operands))
             return constant(value, BOOL if OPERATIONS[name].is_test else self.dtype(operands[-1]))
@@ -219,13 +224,15 @@ class Graph:
     def map(self, name: Any, *arrays: Any) -> Any:
         """Give the scalars of an operation on each entry of arrays of scalars, which are broadcast."""
         op = self.op
-        if all(isinstance(array, int) for array in arrays):
+        shapes = {array.shape for array in arrays if not isinstance(array, int)}
+        if not shapes:
             return op(name, *arrays)
-        arrays = np.broadcast_arrays(*arrays)
-        if not arrays[0].shape:
-            return np.array(op(name, *map(int, arrays)))
-        lists = [array.ravel().tolist() for array in arrays]
-        return np.array([op(name, *each) for each in zip(*lists, strict=True)], np.int64).reshape(arrays[0].shape)
+        if len(shapes) > 1:  # which takes NumPy longer than all else here
+            arrays = np.broadcast_arrays(*arrays)
+            shapes = {arrays[0].shape}
+        (shape,) = shapes
+        lists = [repeat(array) if isinstance(array, int) else array.ravel().tolist() for array in arrays]
+        return np.array([op(name, *each) for each in zip(*lists, strict=False)], np.int64).reshape(shape)
 
     def loop(self, count: int, initial: Iterable[int], body: Callable[..., Iterable[int]]) -> tuple[int, ...]:
         """Add a loop of known length. `body`: (index, *carried) -> what is carried to the next pass."""
