@@ -2,12 +2,13 @@
 
 first-runs: `linkax.assemble` (all that a scene does for its start), `linkax.simulate` over 10 s and the reaction of a
 joint: by how much the first of equal runs takes longer than the others; `run_ms` is `simulate` alone, once compiled.
-gradient: likewise the derivative of M1n's end after 1 s by the mass of its rod, with the assembly of its start and from
-a given start. programs: compiled as one each, simulations and their gradients: the crank-slider SC1 over 10 s;
-Bricard's mechanism over 1 s; and a row of four four-bars over 1 s with twenty parameters: masses and inertias of nine
-bodies, gravity, angle at the start. processes: wall time of whole processes, medians: imports, answers of the command
-line, and the README's crank-slider from the start of Python to a reaction, for the first time and with the programs
-that an earlier process has kept.
+Then what is asked besides, each for the first time: energy, passages, error estimate. floor: diffrax alone, an equation
+of two states. gradient: likewise the derivative of M1n's end after 1 s by the mass of its rod, with the assembly of its
+start and from a given start; and `linkax.fit` of two masses of M1n to its motion. programs: compiled as one each,
+simulations and their gradients: the crank-slider SC1 over 10 s; Bricard's mechanism over 1 s; and a row of four
+four-bars over 1 s with twenty parameters: masses and inertias of nine bodies, gravity, angle at the start. processes:
+wall time of whole processes, medians: imports, answers of the command line, and the README's crank-slider from the
+start of Python to a reaction, for the first time and with the programs that an earlier process has kept.
 """
 
 import os
@@ -22,6 +23,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import linkax as lx
 from benchmarks.parts import print_parts
@@ -129,11 +131,27 @@ def first_run(name, changes):
         first, ran[stage] = seconds_of(run), least(run)
         waits[stage] = round(first - ran[stage], 2)
     run_ms = milliseconds(ran["simulate_s"] - ran["assemble_s"])
-    return {"scene": name, **changes, **waits, "sum_s": round(sum(waits.values()), 2), "run_ms": run_ms}
+    solution = simulate()
+    asked = {"energy_s": solution.energy, "passages_s": solution.passages, "error_s": solution.error_estimate}
+    questions = {question: round(seconds_of(answer), 2) for question, answer in asked.items()}
+    sum_s = round(sum(waits.values()), 2)
+    return {"scene": name, **changes, **waits, "sum_s": sum_s, "run_ms": run_ms, **questions}
 
 
 def first_runs():
     yield from (first_run(name, changes) for name, changes in FIRST_RUNS)
+
+
+def floor():
+    """Diffrax alone, on a pendulum's equation."""
+    term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -args * jnp.sin(y[0])]))
+    control = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+    run = lambda: diffrax.diffeqsolve(
+        term, diffrax.Dopri8(), 0.0, 10.0, 0.01, jnp.ones(2), 9.81, stepsize_controller=control
+    )
+    jax.clear_caches()
+    first, then = seconds_of(lambda: run().ys), least(lambda: run().ys)
+    yield {"floor": "diffrax, two states", "first_s": round(first - then, 2), "run_ms": milliseconds(then)}
 
 
 def gradients():
@@ -150,6 +168,21 @@ def gradients():
         run = partial(jax.grad(end), 1.0, given)
         first, then = seconds_of(run), least(run)
         yield {"gradient": name, "first_s": round(first - then, 2), "run_ms": milliseconds(then)}
+    yield {"fit": "of two masses", **_fit(settings)}
+
+
+def _fit(settings):
+    def angles(masses):
+        mechanism = SCENE.mechanism(settings | masses)
+        return lx.simulate(mechanism, SCENE.initial(mechanism, settings), t1=1.0).q[:, 0]
+
+    true = {"crank_mass": 1.0, "rod_mass": 1.5}
+    measured = angles(true) + 1e-3 * np.random.default_rng(0).normal(size=201)
+    residual = lambda masses, measured: angles(masses) - measured
+    run = lambda: lx.fit(residual, {"crank_mass": 0.8, "rod_mass": lx.Positive(1.2)}, (measured,), progress=False).loss
+    jax.clear_caches()
+    first, then = seconds_of(run), least(run)
+    return {"first_s": round(first - then, 2), "run_ms": milliseconds(then)}
 
 
 def programs():
@@ -192,5 +225,11 @@ def processes():
 
 
 if __name__ == "__main__":
-    parts = {"first-runs": first_runs, "gradient": gradients, "programs": programs, "processes": processes}
+    parts = {
+        "first-runs": first_runs,
+        "floor": floor,
+        "gradient": gradients,
+        "programs": programs,
+        "processes": processes,
+    }
     print_parts(__doc__, parts)

@@ -16,7 +16,7 @@ from linkax.xla.users_line import warn
 COMPILING = "/jax/core/compile/backend_compile_duration"  # what JAX tells its listeners before XLA compiles, and after
 # Functions that let go of compiled programs, and of what they were made of.
 CACHES = [eqx.clear_caches, jax.clear_caches, scalarjit.clear_caches]
-ROOM = 10_000  # memory maps; the largest programs of linkax take 4000
+ROOM = 10_000  # memory maps; long programs of XLA take some thousand, those of a mechanism fifty
 # Programs that have so much room each, and are compiled before maps are counted again: to count 30 000 of them takes
 # 25 ms, as long as to compile a small program.
 _fitting = [0]
