@@ -75,8 +75,8 @@ def test_the_test_sees_them():
 def test_passages(large):
     mechanism, state = large
     pairs = (jnp.tile(part, (COUNT, 2, 1)) for part in (state.q, state.v))
-    ts, places = jnp.tile(jnp.array([0.0, 1.0]), (COUNT, 1)), jnp.ones(COUNT)
-    assert not batched_calls(between_states, mechanism, lx.TangentSpace(), None, ts, *pairs, places)
+    ts, places, there = jnp.tile(jnp.array([0.0, 1.0]), (COUNT, 1)), jnp.ones(COUNT), jnp.ones(COUNT, bool)
+    assert not batched_calls(between_states, mechanism, lx.TangentSpace(), None, there, ts, *pairs, places)
 
 
 READINGS = {

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from diffrax import ThirdOrderHermitePolynomialInterpolation
-from jaxtyping import Float, Inexact, Int
+from jaxtyping import Bool, Float, Inexact, Int
 
 from linkax.equations.coordinates import on_manifold, rates, speeds
 from linkax.equations.system import system_of
@@ -16,6 +16,7 @@ from linkax.formulations.classical import ClassicalFormulation
 from linkax.formulations.tangent_space import TangentSpace
 from linkax.model.mechanism import Mechanism
 from linkax.simulation.explain.error_estimate import has_parts, num_saves, part_of_run
+from linkax.simulation.integrate.map_saved_times import map_saved_times
 from linkax.simulation.integrate.results import ENDED_WELL, SimulationError, Solution, result_name
 from linkax.simulation.start.state import State
 from linkax.xla.arrays import Array
@@ -263,10 +264,10 @@ def _between(solution, pairs, places):
     changes, distances, states = [], [np.zeros(0)], [np.zeros((0, solution.q.shape[-1]))]
     for first in range(0, len(places), BATCH):
         taken = np.arange(first, min(first + BATCH, len(places)))
-        filled = np.resize(taken, BATCH)  # one shape, so that one program serves
+        filled, there = np.resize(taken, BATCH), np.arange(BATCH) < len(taken)  # one shape, so that one program serves
         ts, qs, vs, _ = pairs.taken(filled)
         motion = solution.mechanism, solution.run.tangent_space, solution.rank_nearby
-        found = between_states(*motion, ts, qs, vs, places[filled])
+        found = between_states(*motion, there, ts, qs, vs, places[filled])
         change, projector, distance, q = (np.asarray(part)[: len(taken)] for part in found)
         changes += map(_Change, change, projector)
         distances, states = [*distances, distance], [*states, q]
@@ -308,6 +309,7 @@ def between_states(
     mechanism: Mechanism,
     tangent_space: TangentSpace,
     rank_nearby: Int[Array, " k"] | None,
+    there: Bool[Array, " n"],
     ts: Float[Array, "n 2"],
     qs: Float[Array, "n 2 n_q"],
     vs: Float[Array, "n 2 n_v"],
@@ -315,7 +317,7 @@ def between_states(
 ) -> tuple[Float[Array, "n m m"], Float[Array, "n m m"], Float[Array, " n"], Float[Array, "n n_q"]]:
     """J at shares between two states times its right inverse G at the first; J G there; d and q at the shares.
 
-    All with a leading axis.
+    All with a leading axis; NaN where no states are `there`.
     """
     dtype = qs.dtype
     system, method = system_of(mechanism, dtype), tangent_space.prepared(dtype, rank_nearby)
@@ -326,4 +328,4 @@ def between_states(
         before, right_inverse, _ = method.right_inverse(system, ts[0], qs[0])
         return here @ right_inverse, before @ right_inverse, distance, q
 
-    return jax.vmap(scalarised(at))(ts, qs, vs, places)
+    return map_saved_times(at, there, ts, qs, vs, places)
