@@ -150,7 +150,7 @@ def test_ctrl_c_while_linkax_is_imported():
 
 PENDULUM = ["simulate", "pendulum", "--t1", "2", "--preset", "draft"]
 LONG = ["simulate", "pendulum", "--t1", "1e5"]
-COMPARED = ["compare", "pendulum", "--t1", "2000"]  # ten seconds of running, however fast all is compiled
+COMPARED = ["compare", "pendulum", "--t1", "2000"]  # three seconds of running and more, however fast all is compiled
 PART = {"trajectory-interrupted.npz", "summary-interrupted.json"}
 
 
@@ -184,7 +184,7 @@ def test_ctrl_c_at_each_moment_of_a_command(command, after, wait, left, tmp_path
 
 @pytest.mark.slow
 def test_ctrl_c_keeps_the_formulations_that_were_compared(tmp_path):
-    code, lines = interrupted([*COMPARED, "--out", str(tmp_path)], SOURCE, after="running", wait=3.0)
+    code, lines = interrupted([*COMPARED, "--out", str(tmp_path)], SOURCE, after="running", wait=1.0)
     kept = tmp_path / "comparison-interrupted.json"
     # The machine decides how many are compared by then, or whether one is.
     told = f"; what was compared is in {kept}" if kept.exists() else ""
